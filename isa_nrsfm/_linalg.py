@@ -11,7 +11,7 @@ results are finite for any matrix.
 
 import math
 from functools import cache
-from itertools import repeat
+from itertools import accumulate, pairwise, repeat
 from typing import Any
 
 import numpy as np
@@ -89,11 +89,9 @@ def _places(k: int) -> NDArray:
 
 def packed_rows(packed: NDArray) -> list[NDArray]:
     """Return views of the rows of packed matrices, each from the diagonal on."""
-    rows, start = [], 0
-    for length in range(math.isqrt(2 * len(packed)), 0, -1):
-        rows.append(packed[start : start + length])
-        start += length
-    return rows
+    lengths = range(math.isqrt(2 * len(packed)), 0, -1)
+    ends = accumulate(lengths, initial=0)
+    return [packed[start:end] for start, end in pairwise(ends)]
 
 
 def unpacked(packed: NDArray) -> NDArray:
@@ -215,8 +213,7 @@ def _eliminated(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
         packed[places[i]] = scaled
         np.negative(inverse, out=rows[i][0])
     # With where=... NumPy rounds differently next to entries that are left out.
-    logarithms = np.log(np.where(inverses > 0, inverses, 1.0))
-    return -logarithms.sum(axis=0), positive
+    return -np.log(np.where(inverses > 0, inverses, 1.0)).sum(axis=0), positive
 
 
 def _inverse_pivot(pivot: NDArray, floor: NDArray, positive: NDArray) -> NDArray:
@@ -268,8 +265,7 @@ def of_frames(values: Any, frames: NDArray | slice) -> Any:
     The frames stay the last axis in memory. None stays None.
     """
     if isinstance(values, tuple):
-        parts = map(of_frames, values, repeat(frames))
-        return getattr(values, "_make", tuple)(parts)
+        return getattr(values, "_make", tuple)(map(of_frames, values, repeat(frames)))
     if not isinstance(values, np.ndarray):
         return values if values is None else values.of_frames(frames)
     return values[..., frames] if isinstance(frames, slice) else values.take(frames, -1)

@@ -62,10 +62,9 @@ def refuse_odd(n_columns: int, layout: Layout) -> None:
 
 def two_of(n_numbers: int, layout: Layout) -> str:
     """Return what makes a table X of the first two numbers of points."""
-    shape, two = (
-        ("-1, {}", "..., :2") if layout == "interleaved" else ("{}, -1", ":, :2")
-    )
-    shape = shape.format(n_numbers)
+    shape, two = f"-1, {n_numbers}", "..., :2"
+    if layout == "planar":
+        shape, two = f"{n_numbers}, -1", ":, :2"
     return f"np.asarray(X).reshape(len(X), {shape})[{two}].reshape(len(X), -1)"
 
 
@@ -168,28 +167,25 @@ def centred_frames(rows: NDArray) -> tuple[NDArray, FrameReport]:
     # Coordinates are equal up to four units in the last place of the largest one.
     eps = 4 * np.finfo(rows.dtype).eps
     seen = seen_points(rows)
-    n_seen, hidden = seen.sum(axis=1), None if seen.all() else ~seen[:, None]
+    n_seen, hidden = seen.sum(axis=1), ~seen[:, None]
     centred = np.array(rows, dtype=float, order="C")
-    if hidden is not None:
-        np.copyto(centred, 0.0, where=hidden)
+    np.copyto(centred, 0.0, where=hidden)
     translation = np.full((len(rows), 2), np.nan)
     total, visible = centred.sum(axis=2), n_seen[:, None] > 0
     np.divide(total, n_seen[:, None], where=visible, out=translation)
     centred -= translation[:, :, None]
-    if hidden is not None:
-        np.copyto(centred, 0.0, where=hidden)
+    np.copyto(centred, 0.0, where=hidden)
     x, y = centred.swapaxes(0, 1)
     xx, yy = np.vecdot(x, x), np.vecdot(y, y)
     square, place = xx + yy, np.linalg.norm(translation, axis=1)
     in_one_place = (n_seen > 0) & (square <= n_seen * (eps * place) ** 2)
-    on_line = np.zeros(len(rows), dtype=bool)
-    if hidden is not None:
-        # Twice the square of the distances from the principal axis, roughly
-        scatter = square - np.hypot(xx - yy, 2.0 * np.vecdot(x, y))
-        near = scatter <= 4 * n_seen * (eps * place) ** 2 + 1e-6 * square
-        part = near & ~seen.all(axis=1)
-        on_line[part] = _collinear(centred[part], place[part], n_seen[part], eps)
-        np.copyto(centred, np.nan, where=hidden)
+    # Twice the square of the distances from the principal axis, roughly
+    scatter = square - np.hypot(xx - yy, 2.0 * np.vecdot(x, y))
+    on_line = scatter <= 4 * n_seen * (eps * place) ** 2 + 1e-6 * square
+    on_line &= ~seen.all(axis=1)
+    candidates = centred[on_line], place[on_line], n_seen[on_line]
+    on_line[on_line] = _collinear(*candidates, eps)
+    np.copyto(centred, np.nan, where=hidden)
     size = np.sqrt(square / (2 * np.maximum(n_seen, 1)))
     return centred, FrameReport(translation, size, n_seen, in_one_place, on_line)
 
@@ -593,8 +589,7 @@ def open_table(
     else:
         # A block needs at most eight times its own memory, copies included.
         memory = 2**20 * get_config()["working_memory"]
-        numbers = memory / (8 * np.dtype(float).itemsize)
-        limit = max(int(numbers // n_columns), 1)
+        limit = max(int(memory / 8 // (n_columns * np.dtype(float).itemsize)), 1)
         if isinstance(X, np.memmap):
             limit = min(limit, length)
         else:  # row groups of parquet files are read whole for each block

@@ -18,11 +18,12 @@ from typing import IO
 
 from isa_nrsfm._compat.texts import printable
 
+ASIDE = ".isa-nrsfm-"
+StrPath = str | os.PathLike[str]
+
 
 @contextlib.contextmanager
-def reading(
-    path: str | os.PathLike[str], what: str, expected: str | None = None
-) -> Iterator[None]:
+def reading(path: StrPath, what: str, expected: str | None = None) -> Iterator[None]:
     """Name the file in each reading error; raise ValueErrors for damaged content.
 
     Damaged content makes h5py, pyarrow, zipfile, json and others raise errors of many
@@ -52,13 +53,13 @@ def reading(
         ) from error
 
 
-def _state(path: str | os.PathLike[str]) -> tuple[int, int] | None:
+def _state(path: StrPath) -> tuple[int, int] | None:
     """Return size and time of the last change of a file; None if there is none."""
     found = Path(path).stat() if Path(path).exists() else None
     return None if found is None else (found.st_size, found.st_mtime_ns)
 
 
-def refuse_special(path: str | os.PathLike[str]) -> None:
+def refuse_special(path: StrPath) -> None:
     """Raise if a path is a pipe or a device: readers open a file several times."""
     if Path(path).exists() and not (Path(path).is_file() or Path(path).is_dir()):
         reason = "is a pipe or a device. Save its content as a file"
@@ -80,11 +81,6 @@ def _message(error: Exception) -> str:
         return printable(str(error))
     encoding = error.encoding.upper()
     return f"its text is not in {encoding} ({error}). Save it as {encoding}"
-
-
-ASIDE = ".isa-nrsfm-"
-
-StrPath = str | os.PathLike[str]
 
 
 def write_whole(path: StrPath, contents: bytes) -> None:

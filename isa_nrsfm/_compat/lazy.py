@@ -24,10 +24,9 @@ def lazy_names(
     raised unchanged, and at once if `EAGER_IMPORT` is set.
     """
     namespace = vars(sys.modules[package])
-    source = ast.parse(namespace["__loader__"].get_source(package))
     modules = {
         alias.name: str(node.module)
-        for block in source.body
+        for block in ast.parse(namespace["__loader__"].get_source(package)).body
         if isinstance(block, ast.If)
         for node in block.body
         if isinstance(node, ast.ImportFrom)
@@ -61,9 +60,8 @@ def import_optional(name: str, *, extra: str) -> Any:
     try:
         return import_module(name)
     except ImportError as error:
-        package = name.partition(".")[0]
         raise ImportError(
-            f"{package} is needed here and is not installed: "
+            f"{name.partition('.')[0]} is needed here and is not installed: "
             f'pip install "isa-nrsfm[{extra}]"'
         ) from error
 

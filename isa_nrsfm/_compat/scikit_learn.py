@@ -21,14 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 from sklearn.base import ClassNamePrefixFeaturesOutMixin, _fit_context
 from sklearn.utils import _param_validation, _safe_indexing as taken_rows
-from sklearn.utils._param_validation import (
-    HasMethods as HasMethods,
-    StrOptions as StrOptions,
-)
+from sklearn.utils._param_validation import HasMethods, StrOptions
 from sklearn.utils.parallel import _get_threadpool_controller as threadpool_controller
 from sklearn.utils.validation import _num_samples as number_of_rows
 
-__all__ = ["number_of_rows", "taken_rows", "threadpool_controller"]
+__all__ = ["HasMethods", "StrOptions", "number_of_rows", "taken_rows"]
 
 Function = TypeVar("Function", bound=Callable[..., Any])
 Class = TypeVar("Class", bound=type)
@@ -44,11 +41,8 @@ class Interval(_param_validation.Interval):
         return not isinstance(value, bool) and bool(super().is_satisfied_by(value))
 
 
-N_JOBS = [
-    None,
-    Interval(Integral, None, -1, closed="right"),
-    Interval(Integral, 1, None, closed="left"),
-]
+AT_LEAST_ONE = Interval(Integral, 1, None, closed="left")
+N_JOBS = [None, Interval(Integral, None, -1, closed="right"), AT_LEAST_ONE]
 
 
 def fit_context(*, nested: bool) -> Callable[[Function], Function]:

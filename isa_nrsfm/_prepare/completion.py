@@ -54,8 +54,7 @@ def completion_model(
     for step in range(max_iter):
         _, before = model
         model, mean_square = _em_step(model, *frames)
-        stands_still = step > 0 and model[1] > (1.0 - tol) * before
-        if stands_still or mean_square < 1e-20:
+        if mean_square < 1e-20 or (step > 0 and model[1] > (1.0 - tol) * before):
             break
     return model
 
@@ -91,8 +90,7 @@ def _principal_axes(rows: NDArray, rank: int) -> Model:
     # EM cannot move directions of zero variance.
     variances = np.maximum(values, 1e-3 * max(values[-1], OF_STEPS))
     B = (axes * np.sqrt(variances)).T
-    noise = max(remainder, 1e-6 * values[-1], OF_STEPS)
-    return centred(B), noise
+    return centred(B), max(remainder, 1e-6 * values[-1], OF_STEPS)
 
 
 def _posterior(

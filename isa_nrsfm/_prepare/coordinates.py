@@ -72,10 +72,9 @@ def still_points(tracks: NDArray) -> NDArray:
     Tracks are (n_frames, n_points, 2). Medians: a point may be wrong in some frames.
     The origin of the coordinates is a point of aligned objects.
     """
-    n_frames, n_points, _ = tracks.shape
     tracks = tracks / (np.nanmax(np.abs(tracks), initial=0.0) or 1.0)  # no overflow
-    visible = np.isfinite(tracks[..., 0]).sum(axis=0) > 1
-    if n_frames < 10 or visible.sum() < n_points:
+    n_seen = np.isfinite(tracks[..., 0]).sum(axis=0)
+    if len(tracks) < 10 or n_seen.min(initial=2) < 2:
         return np.arange(0)
     way = np.linalg.norm(tracks - np.nanmedian(tracks, axis=0), axis=2)
     way = np.nanmedian(way, axis=0)

@@ -193,8 +193,7 @@ def _unless_many(rows: NDArray, hidden: NDArray) -> NDArray:
     """Return the seen ones of hidden points (n, J); none if a frame has too many."""
     visible = seen_points(rows)
     gross = hidden & visible
-    frame_mask = gross.sum(axis=1) <= 0.4 * visible.sum(axis=1)
-    return gross & frame_mask[:, None]
+    return gross & (gross.sum(axis=1) <= 0.4 * visible.sum(axis=1))[:, None]
 
 
 def _rigid_part(
@@ -208,6 +207,5 @@ def _rigid_part(
     first, second = linalg.pair_indices(4)
     moments = (design[:, first] * design[:, second]).T @ ~hidden.T
     inverse = linalg.frames_first(linalg.unpacked(linalg.invert_positive(moments)[0]))
-    inner = np.where(hidden[:, None], 0.0, rows) @ design
-    rigid = inner @ inverse @ design.T
+    rigid = np.where(hidden[:, None], 0.0, rows) @ design @ inverse @ design.T
     return rigid, linalg.lengths(rows - rigid)

@@ -10,32 +10,14 @@ from numpy.typing import NDArray
 from sklearn.utils import check_array
 from sklearn.utils.validation import validate_data
 
+from isa_nrsfm import _tables as tables
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._linalg import OF_DIFFERENCES
 from isa_nrsfm._parameters import named
 from isa_nrsfm._prepare.completion import completion_model
 from isa_nrsfm._prepare.robust import DISTANT, robust_sizes, robustly_centred
-from isa_nrsfm._tables import (
-    CHECKS,
-    FEWEST_POINTS,
-    LAYOUTS,
-    FrameBlocks,
-    FrameReport,
-    Layout,
-    centred_frames,
-    check_frames,
-    checked_range,
-    describe_point,
-    seen_points,
-    table_to_rows,
-    tracks_to_table,
-    two_of,
-    unmasked,
-    warn_of_half_points,
-    weighted_sizes,
-    without_half_points,
-)
+from isa_nrsfm._tables import FrameBlocks, FrameReport, Layout, seen_points, unmasked
 from isa_nrsfm.skeletons._column_names import names_layout, parse_coordinate
 
 # With fewer frames or points than this the layouts are not compared.
@@ -75,13 +57,14 @@ def validated_table(estimator: Any, X: Any, layout: Layout, reset: bool) -> NDAr
     """Return a table as an array of numbers, checked by scikit-learn and by name."""
     check_table(X, layout)
     minimum = dict.fromkeys(("ensure_min_samples", "ensure_min_features"), 1 + reset)
+    checks = tables.CHECKS | minimum
     try:
-        X = validate_data(estimator, unmasked(X), reset=reset, **minimum, **CHECKS)
+        X = validate_data(estimator, unmasked(X), reset=reset, **checks)
     except ValueError as error:
         if "could not convert" in str(error):
             raise ValueError(f"X has texts: {error}. {ONLY_POINTS}") from error
         raise
-    return checked_range(np.asarray(X))
+    return tables.checked_range(np.asarray(X))
 
 
 def check_names(names: Sequence[Hashable], layout: Layout) -> None:
@@ -89,15 +72,11 @@ def check_names(names: Sequence[Hashable], layout: Layout) -> None:
     said = names_layout(names)
     if said in (None, layout):
         return
-    other_names = [
-        str(name)
-        for name in names
-        if (coordinate := parse_coordinate(name)) is None or coordinate[0] > 1
-    ]
-    if other_names:
+    others = [str(n) for n in names if (c := parse_coordinate(n)) is None or c[0] > 1]
+    if others:
         raise ValueError(
-            f"{len(other_names)} of the {len(names)} columns are not named as the x or "
-            f"y of a point (first: {other_names[0]!r}). {ONLY_POINTS}"
+            f"{len(others)} of the {len(names)} columns are not named as the x or y of "
+            f"a point (first: {others[0]!r}). {ONLY_POINTS}"
         )
     examples = ", ".join(map(str, names[:4]))
     order: str = said
@@ -141,11 +120,9 @@ def smallest_n_frames(n_components: int, n_points: int) -> int:
 
 def most_components(n_frames: int, n_points: int, camera: str | None = None) -> int:
     """Return the largest K that a table of this size determines, zero if none."""
-    largest = largest_n_components(n_points, camera)
-    possible = [
-        k for k in range(1, largest + 1) if n_frames >= smallest_n_frames(k, n_points)
-    ]
-    return max(possible, default=0)
+    numbers = range(1, largest_n_components(n_points, camera) + 1)
+    enough = (k for k in numbers if n_frames >= smallest_n_frames(k, n_points))
+    return max(enough, default=0)
 
 
 def check_size(
@@ -196,6 +173,10 @@ def check_points(
     """
     if (visible == np.packbits(np.ones(n_points, dtype=bool))).all():
         return
+
+    def name(point: Any) -> str:
+        return tables.describe_point(int(point), *columns)
+
     patterns, counts = np.unique(visible, axis=0, return_counts=True)
     seen = np.unpackbits(patterns, axis=1, count=n_points).astype(bool)
     n_frames, n_shapes = counts @ seen, n_components + 1
@@ -206,9 +187,8 @@ def check_points(
         raise ValueError(
             f"{named('n_components', n_components)} needs every point in at least "
             f"{minimum} frames; fewer show {rare_points.sum()} of {n_points} points "
-            f"(first: {describe_point(point, *columns)}, in {n_frames[point]} of "
-            f"{counts.sum()} frames). Leave out these points, or take fewer basis "
-            "shapes"
+            f"(first: {name(point)}, in {n_frames[point]} of {counts.sum()} "
+            "frames). Leave out these points, or take fewer basis shapes"
         )
     equations = counts @ np.maximum(2 * seen.sum(axis=1) - 8 - n_components, 0)
     unknowns = 3 * n_shapes * (n_points - 1) - n_shapes**2 - 8
@@ -227,9 +207,8 @@ def check_points(
         raise ValueError(
             f"the points fall into {n_groups} groups that no frame shows "
             "together, so that they cannot be joined to one object (first: "
-            f"{describe_point(int(group.argmax()), *columns)} is never visible "
-            f"with {describe_point(0, *columns)} and its group). Add frames that "
-            "show points of both, or fit each group separately"
+            f"{name(group.argmax())} is never visible with {name(0)} and its group). "
+            "Add frames that show points of both, or fit each group separately"
         )
 
 
@@ -248,9 +227,9 @@ def check_arrangement(
     # Some frames, evenly spread
     enough = max(min(1000, 1_000_000 // n_points), 100)
     sample = rows.take(np.arange(0, rows.n_frames, -(-rows.n_frames // enough)))
-    X = tracks_to_table(sample.transpose(0, 2, 1), layout)
-    other = next(name for name in LAYOUTS if name != layout)
-    swapped = table_to_rows(X, other)
+    X = tables.tracks_to_table(sample.transpose(0, 2, 1), layout)
+    other = next(name for name in tables.LAYOUTS if name != layout)
+    swapped = tables.table_to_rows(X, other)
     rigid = _noise_ratio(sample, swapped, scale_frames, 3)
     for n in [] if named else [3, 4]:
         if X.shape[1] % n == 0:
@@ -263,7 +242,7 @@ def check_arrangement(
             if certain > 0.5 or (certain > 0.05 and ratio < min(0.65, rigid)):
                 raise ValueError(
                     f"X seems to have {n} numbers for each point (x, y, z, or a "
-                    f"visibility); x and y are needed. Give {two_of(n, layout)}"
+                    f"visibility); x and y are needed. Give {tables.two_of(n, layout)}"
                 )
     # On real tables the right layout leaves 0.05 to 0.61 of the energy of the wrong
     # one, and the wrong one at least 0.72 of that of the right one.
@@ -292,20 +271,19 @@ def _visibility(parts: NDArray) -> float:
 
 def _noise_ratio(rows: NDArray, other: NDArray, scale_frames: bool, rank: int) -> float:
     """Return the noise of other rows over that of given ones; inf for small tables."""
-    both = [rows, without_half_points(other)[0]]
+    both = [rows, tables.without_half_points(other)[0]]
     # Points that few frames show are left out first, then frames that show few points
     # in one of the orders.
-    both = [r[:, :, seen_points(r).sum(axis=0) >= FEWEST_POINTS] for r in both]
+    both = [r[:, :, seen_points(r).sum(axis=0) >= tables.FEWEST_POINTS] for r in both]
     n_seen = np.min([seen_points(r).sum(axis=1) for r in both], axis=0)
-    both = [r[n_seen >= FEWEST_POINTS] for r in both]
+    both = [r[n_seen >= tables.FEWEST_POINTS] for r in both]
     if min(min(len(r), r.shape[2]) for r in both) < FEWEST_COMPARED:
         return np.inf
     # Low rank explains any table with hardly more numbers than it has unknowns.
     for r in both:
-        unknowns = rank * (2 * len(r) + r.shape[2] - rank)
-        if 2 * seen_points(r).sum() < 1.5 * unknowns:
+        if 2 * seen_points(r).sum() < 1.5 * rank * (2 * len(r) + r.shape[2] - rank):
             return np.inf
-    centred, reports = zip(*map(centred_frames, both), strict=True)
+    centred, reports = zip(*map(tables.centred_frames, both), strict=True)
     # The size of a frame is the smaller of both orders, that of the right one.
     sizes = np.min([report.size for report in reports], axis=0)
     if not scale_frames:
@@ -329,7 +307,7 @@ def _residual(rows: NDArray, rank: int) -> float:
 def checked(name: str, values: Any, *allowed: tuple[int, ...]) -> NDArray:
     """Return values as a finite array of the first of the allowed shapes, or raise."""
     checks: Any = {"input_name": name, "ensure_2d": False, "allow_nd": True}
-    array = check_array(unmasked(values), dtype=CHECKS["dtype"], **checks)
+    array = check_array(unmasked(values), dtype=tables.CHECKS["dtype"], **checks)
     if array.shape not in allowed:
         expected = " or ".join(map(str, allowed))
         raise ValueError(f"{name} must have shape {expected}; got {array.shape}")
@@ -429,20 +407,19 @@ def scaled_table(
     table need not determine shapes.
     """
     layout, names, scale_frames = settings.layout, settings.names, settings.scale_frames
-    robust, camera = settings.loss != "linear", settings.camera
-    if not settings.joint:  # basis shapes are those of the factorisation
-        camera = None
-    determines = settings.prior is None
+    robust, determines = settings.loss != "linear", settings.prior is None
+    # Without the joint fit, basis shapes are those of the factorisation.
+    camera = settings.camera if settings.joint else None
     n_points, dtype = blocks.empty.shape[2], blocks.empty.dtype
     if determines:
         check_size(blocks.n_frames, n_points, n_components, camera)
     examined = blocks.joined(partial(_examine, robust=robust))
     n_half, first, visible, largest, *parts = examined
     if n_half.any():
-        warn_of_half_points(n_half, first, layout, names)
-        blocks = blocks.derive(lambda rows: without_half_points(rows)[0])
+        tables.warn_of_half_points(n_half, first, layout, names)
+        blocks = blocks.derive(lambda rows: tables.without_half_points(rows)[0])
     report = FrameReport(*parts)
-    check_frames(report, n_points)
+    tables.check_frames(report, n_points)
     usable = report.n_seen > 0
     if not usable.all():
         if not usable.any():
@@ -468,11 +445,10 @@ def scaled_table(
     check_arrangement(blocks, n_points, layout, scale_frames, named)
     translation, size, n_seen, *_ = parts
     if weights is not None:
-        size = blocks.joined(weighted_sizes, weights)
+        size = blocks.joined(tables.weighted_sizes, weights)
     if robust:
         # Outliers must not reduce the precision of other points.
-        reach = np.abs(translation).max(axis=1) + DISTANT * size
-        largest = np.minimum(largest, reach)
+        largest = np.minimum(largest, np.abs(translation).max(axis=1) + DISTANT * size)
     if not scale_frames:
         size = np.full_like(size, np.sqrt(np.mean(size**2)))
     # Large complete tables in single precision stay so: it saves memory, and time in
@@ -495,16 +471,15 @@ def scaled_table(
 
 def _examine(rows: NDArray, robust: bool) -> tuple[NDArray, ...]:
     """Return half points, visible points, magnitudes, reports of rows (n, 2, J)."""
-    rows, *half = without_half_points(rows)
-    _, report = centred_frames(rows)
+    rows, *half = tables.without_half_points(rows)
+    _, report = tables.centred_frames(rows)
     usable = report.n_seen > 0
     if robust and usable.any():
         # Outliers must not shift the other points.
         centred, report.translation[usable] = robustly_centred(rows[usable])
         report.size[usable] = robust_sizes(centred)
     largest = np.fmax.reduce(np.abs(rows), axis=(1, 2), initial=0.0)
-    visible = np.packbits(seen_points(rows), axis=1)
-    return *half, visible, largest, *report
+    return *half, np.packbits(seen_points(rows), axis=1), largest, *report
 
 
 def rows_without(rows: NDArray, left_out: NDArray) -> NDArray:
@@ -526,7 +501,7 @@ def weighted_rows(
             "read block by block. Give a NumPy array or a dataframe, or no weights"
         )
     checks: Any = {"input_name": "point_weight", "ensure_min_samples": 0}
-    weights = check_array(unmasked(point_weight), dtype=np.float64, order="C", **checks)
+    weights = check_array(unmasked(point_weight), dtype=float, order="C", **checks)
     shape = rows.n_frames, rows.empty.shape[2]
     if weights.shape != shape:
         raise ValueError(
