@@ -18,18 +18,9 @@ from isa_nrsfm import (
     _parameters as choices,
     _tables as tables,
 )
+from isa_nrsfm._compat import scikit_learn
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import (
-    N_JOBS,
-    CallbackSupportMixin,
-    FitProgress,
-    HasMethods,
-    Interval,
-    Progress,
-    StrOptions,
-    fit_context,
-    with_numpy_defaults,
-)
+from isa_nrsfm._compat.scikit_learn import FitProgress, HasMethods, Interval, StrOptions
 from isa_nrsfm._compat.stored_arrays import Keep, kept_arrays
 from isa_nrsfm._fit import STEPWISE, Images, fit_images, stages_of
 from isa_nrsfm._frames import camera_models
@@ -57,8 +48,8 @@ _OTHER_NAMES = {
 }
 
 
-@with_numpy_defaults
-class AffineNRSfM(CallbackSupportMixin, DiagnosedMixin, BaseEstimator):
+@scikit_learn.with_numpy_defaults
+class AffineNRSfM(scikit_learn.CallbackSupportMixin, DiagnosedMixin, BaseEstimator):
     """
     Affine non-rigid structure from motion by independent subspace analysis.
 
@@ -374,10 +365,7 @@ default="affine"
     _continued: dict[str, Any] | None = None
     _held: tuple[Any, Any, Any] | None = None  # a fitted table, weights, both opened
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        "n_components": [
-            Interval(Integral, 1, None, closed="left"),
-            StrOptions({"auto"}),
-        ],
+        "n_components": [scikit_learn.AT_LEAST_ONE, StrOptions({"auto"})],
         "isa": [None, HasMethods(["fit", "get_params", "set_params"])],
         "block_recovery": [StrOptions(set(choices.BLOCK_RECOVERIES))],
         "refinement": [StrOptions(set(choices.REFINEMENTS)), None],
@@ -391,11 +379,11 @@ default="affine"
         "layout": [StrOptions(set(tables.LAYOUTS))],
         "scale_frames": ["boolean"],
         "hidden_points": ["boolean"],
-        "max_iter": [Interval(Integral, 1, None, closed="left")],
+        "max_iter": [scikit_learn.AT_LEAST_ONE],
         "tol": [None, Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
         "keep_frames": ["boolean", str, HasMethods("__fspath__")],
-        "n_jobs": N_JOBS,
+        "n_jobs": scikit_learn.N_JOBS,
         "verbose": ["verbose"],
     }
 
@@ -444,7 +432,7 @@ default="affine"
         self.n_jobs = n_jobs
         self.verbose = verbose
 
-    @fit_context(nested=True)
+    @scikit_learn.fit_context(nested=True)
     def fit(
         self, X: Any, y: Any = None, *, point_weight: Any = None, groups: Any = None
     ) -> Self:
@@ -529,7 +517,7 @@ default="affine"
         self,
         X: Any,
         point_weight: Any,
-        progress: Progress,
+        progress: scikit_learn.Progress,
         *,
         keep: Keep = dict,
         groups: Any = None,
@@ -569,20 +557,18 @@ default="affine"
             left = reported.alpha - fitted_model.removed_part(self, frames.motion)
             reported = reported._replace(alpha=left)
         if self.keep_frames:
-            for name, part in keep(reported._asdict()).items():
-                attributes[f"{name}_"] = source.as_collected(part)
+            kept = {f"{name}_": part for name, part in keep(reported._asdict()).items()}
             if not settings.joint:
-                del attributes["alpha_std_"]
+                del kept["alpha_std_"]
             if self.camera != "affine":
-                for name, part in model.cameras(frames).items():
-                    attributes[name] = source.as_collected(part)
+                kept |= model.cameras(frames)
+            attributes |= {name: source.as_collected(kept[name]) for name in kept}
         else:
             del attributes["_frame_sizes"]
         self.__dict__.update(attributes)
         if settings.errors and settings.joint:
-            warn_after_fit(
-                self, fitted_model.fitted_prior(self.prior), frames.motion, left_out
-            )
+            of_prior = fitted_model.fitted_prior(self.prior)
+            warn_after_fit(self, of_prior, frames.motion, left_out)
 
     def _ready(
         self, X: Any, point_weight: Any = None
@@ -592,11 +578,8 @@ default="affine"
         params = self.get_params(deep=False)
         choices.check_requirements(params | {"point_weight": point_weight})
         if not joint:
-            if tables.is_on_dask(X) or isinstance(X, tables.StoredTable):
-                raise ValueError(
-                    "a table that is not in memory needs refinement='joint'; got "
-                    f"refinement={self.refinement!r}"
-                )
+            what = f"refinement={self.refinement!r}, unlike refinement='joint',"
+            tables.refuse_stored(X, what)
             if isinstance(X, np.memmap):
                 X = np.asarray(X)
         scaling.check_camera(self)
@@ -763,9 +746,8 @@ default="affine"
         frames = self._jointly_fitted("smooth")
         alone = table.joined(self._model.linearised, *weights)
         camera, dtype = camera_models.CAMERAS[frames.camera], table.empty.dtype
-        result = smooth(
-            alone, frames.gauge, camera, time, groups, max_gap, max_iter, tol, dtype
-        )
+        search = time, groups, max_gap, max_iter, tol
+        result = smooth(alone, frames.gauge, camera, *search, dtype)
         fit = result.decomposition
         if self._model.pinhole is not None:
             fit = table.joined(self._model.in_table_cameras, *fit)
@@ -921,8 +903,7 @@ default="affine"
         if not return_std:
             return fitted_model.of_fits(self, shapes_of, X, point_weight)
         table, weights = self._opened(X, point_weight)
-        uncertain = partial(model.uncertain_shapes, turned=turned)
-        return table.collect(uncertain, *weights)
+        return table.collect(partial(model.uncertain_shapes, turned=turned), *weights)
 
     def shapes(self, alpha: Any) -> NDArray:
         """
@@ -1121,9 +1102,8 @@ default="affine"
             choices.check_requirements(parameters | {"loss": frames.loss})
         if tables.is_read_later(X):
             scaling.check_table(X, layout)
-            validate_data(
-                self, tables.column_sample(X), reset=reset, skip_check_array=True
-            )
+            empty = tables.column_sample(X)
+            validate_data(self, empty, reset=reset, skip_check_array=True)
         else:
             X = scaling.validated_table(self, X, layout, reset)
         names = getattr(self, "feature_names_in_", None)

@@ -40,41 +40,21 @@ from sklearn.base import clone
 from isa_nrsfm._compat.caller import warn_caller
 from isa_nrsfm._compat.scikit_learn import NoProgress, Progress, one_blas_thread
 from isa_nrsfm._fitted_model import TableModel, prior_start
-from isa_nrsfm._frames import gauge
-from isa_nrsfm._frames.camera_models import (
-    Pinhole,
-    common,
-    compose,
-    distances,
-    line_of_sight,
-    mean_view,
-    nearest_calibrated,
-    pinhole_of,
-)
+from isa_nrsfm._frames import camera_models, gauge
+from isa_nrsfm._frames.camera_models import Pinhole, pinhole_of
 from isa_nrsfm._frames.models import Decomposition, FrameMap, FrameModel, spread_starts
-from isa_nrsfm._joint import uncertainty
+from isa_nrsfm._joint import fit as joint_fit, uncertainty
 from isa_nrsfm._joint.bagging import bagged
 from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
-from isa_nrsfm._joint.fit import (
-    count_components,
-    fit_jointly,
-    left_out_distances,
-    other_fits,
-)
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
 from isa_nrsfm._joint.starts import extended_shapes, lifted_shapes, rigid_start
 from isa_nrsfm._parameters import JOINT_REFINEMENTS
+from isa_nrsfm._prepare import scaling
 from isa_nrsfm._prepare.completion import complete_rows
 from isa_nrsfm._prepare.robust import TUNING, gross_outliers
-from isa_nrsfm._prepare.scaling import (
-    ScaledTable,
-    largest_n_components,
-    most_components,
-    rows_without,
-    scaled_table,
-)
+from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables import FrameBlocks, of_all_rows, spread
 from isa_nrsfm.isa import _pipeline as pipeline
 
@@ -208,8 +188,7 @@ def fit_table(
     wanted, first = n_components, settings
     # Calibrated cameras: the fit does not depend on the number of coefficients.
     if settings.all_directions:
-        possible = most_components(len(table.sizes), table.n_points, settings.camera)
-        n_components = min(MOST_FIRST, possible)
+        n_components = possible_components(table, settings)
     # 1. and 2. The rest of the table, and its factorisation
     factorised = _factorised(table, n_components, settings, progress)
     # 3. and 4. The paper's pipeline
@@ -235,8 +214,7 @@ def fit_table(
         fit = _joint_fit(factorised, shapes, start, settings, wanted, progress)
         # Down-weighted outliers, for example, look like basis shapes at first.
         supported = max(uncertainty.n_reliable(fit.attributes["reliability_"]), 1)
-        falls = settings.free and not settings.all_directions
-        if falls and supported < n_components:
+        if settings.free and not settings.all_directions and supported < n_components:
             progress("gauge and coefficients")
             first = first._replace(known=None)
             return fit_table(table, supported, isa, first, NoProgress())
@@ -275,7 +253,7 @@ def _joint_fit(
     table, settings = factorised.scaled, settings._replace(on_step=progress.step)
     cache = {} if settings.known is None else settings.known
     if "joint" not in cache:
-        cache["joint"] = fit_jointly(factorised, shapes, start, settings)
+        cache["joint"] = joint_fit.fit_jointly(factorised, shapes, start, settings)
     fit, tracks, alpha = cache["joint"]
     settings = settings._replace(shape_prior=fit.prior)
     progress(JOINT_STAGE)
@@ -305,7 +283,7 @@ def _joint_fit(
             model, widths = mean
             tracks = JointFrames.from_points(table.rows, table.complete, table.weights)
     if grouped:
-        alternatives = partial(other_fits, factorised, shapes, settings, fit)
+        alternatives = partial(joint_fit.other_fits, factorised, shapes, settings, fit)
         model, widths = consensus(model, table, settings, fit, alternatives), None
         tracks = JointFrames.from_points(table.rows, table.complete)
     if settings.refinement == "consensus":
@@ -318,7 +296,7 @@ def _joint_fit(
     }
     if errors and settings.loss == "linear" and table.weights is None:
         sample = spread(np.arange(len(table.sizes)), 100)
-        distance = left_out_distances(model, table.rows.take(sample))
+        distance = joint_fit.left_out_distances(model, table.rows.take(sample))
         attributes["_left_out"] = distance, np.flatnonzero(table.shown)[sample]
     if (n_more := n_components + 1 - len(model.shapes)) > 0:
         # Coefficients beyond the directions that a table supports are zero.
@@ -342,14 +320,18 @@ def supported_components(
     table: ScaledTable, isa: Any, settings: FitSettings, progress: Progress
 ) -> int:
     """Return the number of relevant basis shapes of affine cameras, at most twelve."""
-    possible = most_components(len(table.sizes), table.n_points, settings.camera)
-    K = min(MOST_FIRST, possible)
-    quiet = NoProgress()
+    K, quiet = possible_components(table, settings), NoProgress()
     factorised = _factorised(table, K, settings, quiet)
     factors = factorised.factors
     shapes, *_ = pipeline.run_paper_pipeline(factors, K, clone(isa), settings, quiet)
     progress("number of basis shapes")
-    return count_components(factorised, shapes, settings)
+    return joint_fit.count_components(factorised, shapes, settings)
+
+
+def possible_components(table: ScaledTable, settings: FitSettings) -> int:
+    """Return the largest number of basis shapes of first fits of a table."""
+    size = len(table.sizes), table.n_points
+    return min(MOST_FIRST, scaling.most_components(*size, settings.camera))
 
 
 def _factorised(
@@ -359,17 +341,17 @@ def _factorised(
     limits, n_points = settings.limits, table.n_points
     # Calibrated cameras can have more basis shapes than the factorisation.
     n_triplets = min(3 * n_components + 3, n_points - 1)
-    n_components = min(n_components, largest_n_components(n_points))
+    n_components = min(n_components, scaling.largest_n_components(n_points))
     outliers, completed, complete = None, table.rows, table.complete
     if settings.loss != "linear":
         outliers = gross_outliers(table.rows, limits.model_frames)
-        completed = table.rows.derive(rows_without, outliers)
+        completed = table.rows.derive(scaling.rows_without, outliers)
         complete = complete and not outliers.any()
     if complete:  # kept, because the factorisation reads it up to ten times
         completed = completed.derive(np.asarray)
     else:
-        model_frames = limits.model_frames
-        completed = complete_rows(completed, n_points, n_components, model_frames)
+        size = n_points, n_components, limits.model_frames
+        completed = complete_rows(completed, *size)
     report("table")
     shape = 2 * len(table.sizes), n_points
     triplets = pipeline.block_triplets(completed, shape, n_triplets, limits.dense)
@@ -377,10 +359,8 @@ def _factorised(
     # With a prior there may be few frames.
     values = np.pad(values, (0, n_triplets - len(values)))
     if settings.joint:
-        rigid, first = vectors[:3], limits.sample
-        W, parts = pipeline.sample_frames(
-            completed, n_points, rigid, first, limits.small_table
-        )
+        sizes = limits.sample, limits.small_table
+        W, parts = pipeline.sample_frames(completed, n_points, vectors[:3], *sizes)
     else:
         W, parts = completed.whole().reshape(shape), []
     factors = pipeline.factorise(W, n_components, table.precision, triplets)
@@ -525,19 +505,18 @@ def _joint_frames(
     mean_shape, basis = mean_shape.astype(table.dtype), basis.astype(table.dtype)
     cameras = frames.motion / table.sizes[:, None, None]
     if prior is not None:
-        sight = line_of_sight(cameras)
+        sight = camera_models.line_of_sight(cameras)
         errors = prior.depth_errors(information, noise, sight, frames.alpha)
-        depths = np.vecdot(compose(mean_shape, basis, frames.alpha), sight[:, None])
+        points = camera_models.compose(mean_shape, basis, frames.alpha)
+        depths = np.vecdot(points, sight[:, None])
         model = replace(model, certainty=certainty.of_prior(errors, depths))
     square = (table.unit or 1.0) ** 2
     modes = gauge.mode_covariance(cameras, frames.alpha[:, :n_components])
-    reliability = uncertainty.reliabilities(
-        alpha, covariance, sum(moments), sum(noises)
-    )
+    shares = uncertainty.reliabilities(alpha, covariance, sum(moments), sum(noises))
     attributes |= {
         "mode_covariance_": square * modes,
         "noise_variance_": square * noise,
-        "reliability_": reliability[:n_components],
+        "reliability_": shares[:n_components],
     }
     frames = frames._replace(translation=frames.translation + table.translation)
     fitted = TableModel(model, mean_shape, basis, n_components, s.layout, table.unit)
@@ -558,13 +537,12 @@ def _measures(
 
     def energies(rows: NDArray, *fit: NDArray) -> tuple[float, float]:
         """Return the energies of residuals over visible points, and of frames."""
-        noise = np.nansum(distances(rows, shapes, *fit) ** 2)
+        noise = np.nansum(camera_models.distances(rows, shapes, *fit) ** 2)
         middle = np.nanmean(rows, axis=2, keepdims=True, dtype=np.float64)
         return float(noise), float(np.nansum((rows - middle) ** 2))
 
     passes = table.rows.map(energies, cameras, position, frames.alpha)
     noise, signal = np.sum(list(passes), axis=0)
-    reference = mean_camera(frames, table.sizes, camera)
     return {
         "mean_shape_": mean_shape,
         "basis_": basis[:K],
@@ -572,10 +550,12 @@ def _measures(
         "singular_values_": (table.unit or 1.0) * values[: 3 * K + 3],
         "energy_share_": energy[:K] / (energy.sum() or 1.0),
         "inverse_snr_": float(noise / signal),
-    } | {name: value.astype(table.dtype) for name, value in reference.items()}
+    } | mean_camera(frames, table.sizes, camera, table.dtype)
 
 
-def mean_camera(frames: Decomposition, sizes: NDArray, camera: str) -> dict[str, Any]:
+def mean_camera(
+    frames: Decomposition, sizes: NDArray, camera: str, dtype: Any
+) -> dict[str, NDArray]:
     """Return the attributes of the mean view of frames of some sizes (n,).
 
     That of cameras over the sizes of their frames, times the RMS size. If they have no
@@ -583,16 +563,18 @@ def mean_camera(frames: Decomposition, sizes: NDArray, camera: str) -> dict[str,
     in the cameras.
     """
     motion = frames.motion / sizes[:, None, None]
-    reference = mean_view(motion)
+    reference = camera_models.mean_view(motion)
     if reference is None:
         lengths = np.sqrt(np.mean(np.sum(motion**2, axis=1), axis=0))
         reference = lengths * np.eye(2, 3)
     reference = reference * np.sqrt(np.mean(sizes**2))
     if camera != "affine":
-        (row,), (scale,) = nearest_calibrated(reference[None])
+        (row,), (scale,) = camera_models.nearest_calibrated(reference[None])
         reference = scale * row
-    centre = frames.translation.mean(axis=0)
-    return {"reference_motion_": reference, "reference_translation_": centre}
+    return {
+        "reference_motion_": reference.astype(dtype),
+        "reference_translation_": frames.translation.mean(axis=0).astype(dtype),
+    }
 
 
 class Images(NamedTuple):
@@ -627,7 +609,7 @@ class Images(NamedTuple):
                 depths, arrays = fit.model.depths, (fit.frames.motion, fit.frames.alpha)
                 straight = pinhole.straight
                 rows = rows.derive(lambda r, *f: straight(r, depths(*f)), *arrays)
-        return scaled_table(rows, self.weights, n_components, self.settings)
+        return scaling.scaled_table(rows, self.weights, n_components, self.settings)
 
     def fit(
         self,
@@ -825,7 +807,7 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         if settings.start is not None:
             best = table.started(settings.start, n_components)
         elif given is not None:
-            f = common(given)
+            f = camera_models.common(given)
             virtual = table.pinhole(f, near=False)
             first = table.fit(virtual, number, progress=table.progress)
             fits = {0.0: first, **table.images(first, f)}
@@ -833,8 +815,7 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
             if best.changes[-1] > UNSETTLED and prior is None:
                 why = UNSTEADY
             elif errors:  # neighbours tell how far a focal length contradicts the table
-                places = 0.8 / f, 1.25 / f
-                fits |= {place: table.near(fits, place) for place in places}
+                fits |= {g: table.near(fits, g) for g in (0.8 / f, 1.25 / f)}
         else:
             fits, number = table.searched(n_components), n_components
             place, deviation = minimum(fits)
@@ -890,8 +871,7 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
     sizes, has_depth = attributes["_frame_sizes"], model.frames.certainty.determined
     mask = np.isfinite(sizes)
     seen = Decomposition(*(values[mask] for values in frames))
-    view = mean_camera(seen, sizes[mask], "perspective")
-    attributes |= {name: value.astype(dtype) for name, value in view.items()}
+    attributes |= mean_camera(seen, sizes[mask], "perspective", dtype)
     attributes |= {
         "isa_": best.attributes["isa_"],
         "focal_length_": f if given is None else np.array(given, dtype=float)[()],

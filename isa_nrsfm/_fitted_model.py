@@ -11,25 +11,11 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from sklearn.base import clone
 
+from isa_nrsfm import _tables as tables
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._frames.camera_models import (
-    Pinhole,
-    compose,
-    distances,
-    full_rotations,
-    line_of_sight,
-    pose_part,
-    project,
-    turns_to,
-    zoomed,
-)
-from isa_nrsfm._frames.models import (
-    MIRROR,
-    Decomposition,
-    FrameModel,
-    LinearisedFrames,
-    leverages,
-)
+from isa_nrsfm._frames import camera_models, models
+from isa_nrsfm._frames.camera_models import Pinhole, compose, full_rotations, zoomed
+from isa_nrsfm._frames.models import MIRROR, Decomposition, FrameModel, LinearisedFrames
 from isa_nrsfm._frames.search import FramePosterior
 from isa_nrsfm._joint.prior import LEAST_NOISE, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import JointState
@@ -38,17 +24,7 @@ from isa_nrsfm._linalg import padded
 from isa_nrsfm._parameters import named
 from isa_nrsfm._prepare.robust import median_noise, robust_sizes, robustly_centred
 from isa_nrsfm._prepare.scaling import FEWEST_COMPARED, ScaledTable
-from isa_nrsfm._tables import (
-    FrameBlocks,
-    Layout,
-    centred_frames,
-    is_read_later,
-    of_all_rows,
-    seen_points,
-    spread,
-    tracks_to_table,
-    weighted_sizes,
-)
+from isa_nrsfm._tables import FrameBlocks, of_all_rows, seen_points, spread
 from isa_nrsfm.calibration import DeformationMetric, euclidean_frames
 
 # Level of the two-sided test by which missing points decide on the mirror image: false
@@ -59,6 +35,8 @@ MIRROR_LEVEL = 0.01
 LEAST_MISFIT = 0.005
 # Rows on which held-out points are compared, at most.
 MOST_ROWS = 300
+# Of points (n, J), zero where missing; None where all are one
+Weights = NDArray | None
 
 
 class TableModel(NamedTuple):
@@ -76,7 +54,7 @@ class TableModel(NamedTuple):
     mean_shape: NDArray
     basis: NDArray
     n_components: int
-    layout: Layout
+    layout: tables.Layout
     unit: float | None
     pinhole: Pinhole | None = None
     axes: Pinhole | None = None
@@ -84,7 +62,7 @@ class TableModel(NamedTuple):
     def decompose(
         self,
         rows: NDArray,
-        weights: NDArray | None = None,
+        weights: Weights = None,
         deviations: bool = True,
         dtype: Any = None,
     ) -> Decomposition:
@@ -114,7 +92,8 @@ class TableModel(NamedTuple):
         """
         if self.axes is None:
             return motion
-        turns = turns_to(self.axes.rays(np.asarray(translation)[..., None])[..., 0])
+        sight = self.axes.rays(np.asarray(translation)[..., None])[..., 0]
+        turns = camera_models.turns_to(sight)
         R, scales = full_rotations(np.asarray(motion))
         turned = scales[:, None, None] * (turns.mT @ R)[:, :2]
         return turned.astype(motion.dtype, copy=False)
@@ -130,7 +109,7 @@ class TableModel(NamedTuple):
             found["positions_"] = place.astype(motion.dtype)
         return found
 
-    def straightened(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
+    def straightened(self, rows: NDArray, weights: Weights = None) -> NDArray:
         """Return weak-perspective images.
 
         Depths and fits of a frame are repeated until they agree.
@@ -159,7 +138,7 @@ class TableModel(NamedTuple):
     def depths(self, motion: NDArray, alpha: NDArray) -> NDArray:
         """Return the depths (n, J) of points, in units of the table."""
         shapes = compose(self.mean_shape, self.basis, alpha)
-        return np.vecdot(shapes, line_of_sight(motion)[:, None])
+        return np.vecdot(shapes, camera_models.line_of_sight(motion)[:, None])
 
     def mirrored_attributes(self, known: dict[str, Any]) -> dict[str, Any]:
         """Return the attributes of the mirror image in depth, from those of a fit."""
@@ -223,9 +202,7 @@ class TableModel(NamedTuple):
         decided = min(probability, 1.0 - probability) < MIRROR_LEVEL / 2
         return probability if decided else np.nan
 
-    def posterior(
-        self, rows: NDArray, weights: NDArray | None = None
-    ) -> FramePosterior:
+    def posterior(self, rows: NDArray, weights: Weights = None) -> FramePosterior:
         """Return the fit of each frame, of size one, before the gauge."""
         rows = self.straightened(rows, weights)
         usable, centred, _, sizes, weights = self._ready(rows, weights)
@@ -246,9 +223,7 @@ class TableModel(NamedTuple):
         lengths = distance[np.isfinite(distance)]
         return median_noise(lengths) / float(np.sqrt(expected)) if len(lengths) else 0.0
 
-    def linearised(
-        self, rows: NDArray, weights: NDArray | None = None
-    ) -> LinearisedFrames:
+    def linearised(self, rows: NDArray, weights: Weights = None) -> LinearisedFrames:
         """Return each fit and the likelihood near it, before the gauge."""
         rows = self.straightened(rows, weights)
         usable, centred, translation, sizes, weights = self._ready(rows, weights)
@@ -277,7 +252,7 @@ class TableModel(NamedTuple):
         return shapes @ rotations.mT
 
     def uncertain_shapes(
-        self, rows: NDArray, weights: NDArray | None = None, turned: bool = False
+        self, rows: NDArray, weights: Weights = None, turned: bool = False
     ) -> tuple[NDArray, NDArray]:
         """Return shapes (n, J, 3) and standard deviations (n, J) of their depths."""
         fit, shapes, variances = self._uncertain(rows, weights)
@@ -287,7 +262,7 @@ class TableModel(NamedTuple):
         return shapes.astype(rows.dtype), deviations.astype(rows.dtype)
 
     def points_in_space(
-        self, rows: NDArray, weights: NDArray | None = None
+        self, rows: NDArray, weights: Weights = None
     ) -> tuple[NDArray, NDArray]:
         """Return points and standard deviations (n, J, 3) in the axes of their camera.
 
@@ -300,7 +275,7 @@ class TableModel(NamedTuple):
         return points, np.sqrt(variances)
 
     def _uncertain(
-        self, rows: NDArray, weights: NDArray | None
+        self, rows: NDArray, weights: Weights
     ) -> tuple[Decomposition, NDArray, NDArray]:
         """Return frames, shapes, variances (n, J, 3) of points in units of the table.
 
@@ -326,12 +301,12 @@ class TableModel(NamedTuple):
         lens = self.pinhole or self.axes
         if lens is not None and shares:
             images = zoomed(images, 1.0 / shares[0][..., None], lens.centre[:, 0])
-        return tracks_to_table(images, self.layout)
+        return tables.tracks_to_table(images, self.layout)
 
     def images(self, shapes: NDArray, motion: NDArray, translation: NDArray) -> NDArray:
         """Return images (n, J, 2) of shapes (n, J, 3) in the cameras of the table."""
         if self.pinhole is None:
-            return project(shapes, motion, translation)
+            return camera_models.project(shapes, motion, translation)
         return self.pinhole.projected(shapes, motion, translation)
 
     def distances(self, rows: NDArray, *fit: NDArray) -> NDArray:
@@ -349,7 +324,7 @@ class TableModel(NamedTuple):
             distance *= np.sqrt(weights[0])
         return distance / of_all_rows(sizes, usable)[:, None]
 
-    def held_out(self, rows: NDArray, weights: NDArray | None = None) -> NDArray:
+    def held_out(self, rows: NDArray, weights: Weights = None) -> NDArray:
         """Return squared errors and signals (n, J, 2) of held-out points.
 
         The points are divided into five parts, the same for all tables. Each part is
@@ -382,7 +357,7 @@ class TableModel(NamedTuple):
             held = folds == fold
             # Fit without the held-out points
             visible = np.where(held, np.nan, straight)
-            enough = centred_frames(visible)[1].usable
+            enough = tables.centred_frames(visible)[1].usable
             usable = np.flatnonzero(enough & seen[:, held].any(axis=1))
             if not len(usable):
                 continue
@@ -433,14 +408,14 @@ class TableModel(NamedTuple):
         sample = spread(np.arange(table.n_frames), MOST_ROWS)
         fit = self.posterior(table.take(sample), *(w[sample] for w in weights))
         constant, slope = self.frames.certainty.images
-        leverage = np.nanmean(leverages(fit.alpha))
+        leverage = np.nanmean(models.leverages(fit.alpha))
         return float(np.exp(2.0 * slope * leverage / constant))
 
     def _ready(
-        self, rows: NDArray, weights: NDArray | None = None
+        self, rows: NDArray, weights: Weights = None
     ) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray | None]:
         """Return a mask of usable rows; these centred, centres, sizes and weights."""
-        centred, report = centred_frames(rows)
+        centred, report = tables.centred_frames(rows)
         usable = report.usable
         parts = centred, report.translation, report.size
         centred, translation, sizes = (part[usable] for part in parts)
@@ -449,7 +424,7 @@ class TableModel(NamedTuple):
             sizes = robust_sizes(centred)
         if weights is not None:
             weights = weights[usable]
-            sizes = weighted_sizes(rows[usable], weights)
+            sizes = tables.weighted_sizes(rows[usable], weights)
         if self.unit is not None:
             sizes = np.full(len(centred), self.unit, dtype=float)
         return usable, centred, translation, sizes, weights
@@ -495,7 +470,9 @@ def in_camera_axes(estimator: Any, motion: NDArray, translation: NDArray) -> NDA
 def removed_part(estimator: Any, motion: Any) -> Any:
     """Return the part (n, K) of coefficients that `remove_pose` removes, or zero."""
     effect = getattr(estimator, "pose_effect_", None)
-    return 0.0 if effect is None else pose_part(np.asarray(motion), effect)
+    if effect is None:
+        return 0.0
+    return camera_models.pose_part(np.asarray(motion), effect)
 
 
 def _camera_leverage(mean_shape: NDArray, seen: NDArray) -> NDArray:
@@ -527,7 +504,7 @@ def of_fits(
     Warn if the table does not fit the model. Fits of tables that are read later are not
     kept.
     """
-    later = is_read_later(X)
+    later = tables.is_read_later(X)
     table, weights = estimator._opened(X, point_weight, judged=later)
     shares, n = estimator._focal_shares(table), len(weights)
     fits = partial(estimator._model.decompose, deviations=deviations)
@@ -610,7 +587,8 @@ def adapting_errors(
     of_points = weights[0][::2] if weights else None
     with warnings.catch_warnings(action="ignore"):
         try:
-            adapted.fit(tracks_to_table(rows[::2].mT, layout), point_weight=of_points)
+            X = tables.tracks_to_table(rows[::2].mT, layout)
+            adapted.fit(X, point_weight=of_points)
         except ValueError:
             return np.nan, np.nan
     test_rows = [each[1::2] for each in (rows, *weights)]
@@ -690,7 +668,7 @@ def prior_start(
     weights = None if table.weights is None else table.weights[sample]
     frames = replace(frames, camera="weak_perspective", loss=settings.loss)
     fit = frames.posterior(rows, False, weights)
-    share = far_points(distances(rows, frames.shapes, *fit[:3]), frames)
+    share = far_points(camera_models.distances(rows, frames.shapes, *fit[:3]), frames)
     if checked and share:
         raise ValueError(
             f"the table does not show the points of the prior: they lie {share:.0%} of "

@@ -18,7 +18,6 @@ import copy
 import time
 import warnings
 from collections.abc import Callable, Collection
-from numbers import Integral
 from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
@@ -34,18 +33,9 @@ from sklearn.utils.metadata_routing import UNUSED, MetadataRouter, process_routi
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from isa_nrsfm import _parameters as choices
+from isa_nrsfm._compat import scikit_learn
 from isa_nrsfm._compat.caller import warn_caller
-from isa_nrsfm._compat.scikit_learn import (
-    N_JOBS,
-    CoefficientsMixin,
-    HasMethods,
-    Interval,
-    NoProgress,
-    StrOptions,
-    fit_context,
-    taken_rows,
-    with_numpy_defaults,
-)
+from isa_nrsfm._compat.scikit_learn import HasMethods, StrOptions
 from isa_nrsfm._compat.texts import percent
 from isa_nrsfm._estimator import AffineNRSfM, check_class
 from isa_nrsfm._fitted_model import MOST_ROWS, fitted_prior, unexplained_share
@@ -82,12 +72,12 @@ class StartedNRSfM(AffineNRSfM):
         # Held-out points compare numbers of basis shapes.
         self._continued = {"whole": False, "errors": False} | (self._continued or {})
         with warnings.catch_warnings(record=True, action="always") as caught:
-            self._fit(X, point_weight, NoProgress())
+            self._fit(X, point_weight, scikit_learn.NoProgress())
         self.unconverged = ConvergenceWarning in [each.category for each in caught]
         return self
 
 
-class ChosenMixin(CoefficientsMixin, TransformerMixin, MetaEstimatorMixin):
+class ChosenMixin(scikit_learn.CoefficientsMixin, TransformerMixin, MetaEstimatorMixin):
     """Methods of an estimator that keeps the best of several fits."""
 
     best_estimator_: AffineNRSfM
@@ -136,7 +126,7 @@ class ChosenMixin(CoefficientsMixin, TransformerMixin, MetaEstimatorMixin):
         return self.best_estimator_
 
 
-@with_numpy_defaults
+@scikit_learn.with_numpy_defaults
 class AffineNRSfMCV(ChosenMixin, BaseEstimator):
     """
     `AffineNRSfM` with the number of basis shapes chosen by cross-validation.
@@ -236,12 +226,12 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
     __metadata_request__fit: ClassVar[dict[str, str]] = {"groups": UNUSED}
 
     _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
-        "n_components": ["array-like", Interval(Integral, 1, None, closed="left")],
+        "n_components": ["array-like", scikit_learn.AT_LEAST_ONE],
         "estimator": [None, HasMethods(["fit", "get_params", "set_params"])],
         "cv": ["cv_object"],
         "scoring": [None, str, callable],
         "select": [StrOptions({"best", "one_standard_error"})],
-        "n_jobs": N_JOBS,
+        "n_jobs": scikit_learn.N_JOBS,
         "verbose": ["verbose"],
     }
 
@@ -264,7 +254,7 @@ class AffineNRSfMCV(ChosenMixin, BaseEstimator):
         self.n_jobs = n_jobs
         self.verbose = verbose
 
-    @fit_context(nested=False)
+    @scikit_learn.fit_context(nested=False)
     def fit(self, X: Any, y: Any = None, **params: Any) -> Self:
         """
         Choose the number of basis shapes, and fit the table with it.
@@ -450,7 +440,7 @@ def check_rows(
     if error := refused(X, n_components):
         raise error
     for number, train in enumerate(splits):
-        rows = taken_rows(X, train)
+        rows = scikit_learn.taken_rows(X, train)
         if error := refused(rows, n_components):
             fewer = (k for k in range(n_components)[:0:-1] if not refused(rows, k))
             raise ValueError(
@@ -576,7 +566,7 @@ class Trial(NamedTuple):
         return f"{text}, {self.result}"
 
 
-@with_numpy_defaults
+@scikit_learn.with_numpy_defaults
 class AutoNRSfM(ChosenMixin, BaseEstimator):
     """
     `AffineNRSfM` with the settings that held-out points of the table prefer.
@@ -666,7 +656,7 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
         self.prior = prior
         self.image_size = image_size
 
-    @fit_context(nested=False)
+    @scikit_learn.fit_context(nested=False)
     def fit(self, X: Any, y: Any = None, *, point_weight: Any = None) -> Self:
         """
         Fit a table with the settings that its held-out points prefer.
@@ -703,9 +693,8 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
         params, free = first_settings(given)
         estimator = clone(estimator).set_params(**params)
         point = None if self.image_size is None else np.divide(self.image_size, 2)
-        pinhole = estimator.camera == "perspective"
-        pinhole |= estimator.focal_length is not None
-        if pinhole and estimator.principal_point is None:
+        near = estimator.camera == "perspective" or estimator.focal_length is not None
+        if near and estimator.principal_point is None:
             estimator.set_params(principal_point=point)
         weights = {} if point_weight is None else {"point_weight": point_weight}
         self.best_estimator_, self.trials_ = decided(
@@ -774,7 +763,7 @@ class _Rows(NamedTuple):
         model = StartedNRSfM(**params)
         model._continued = continued
         weights = {name: w[sample] for name, w in self.weights.items()}
-        return model.fit(taken_rows(self.X, sample), **weights)
+        return model.fit(scikit_learn.taken_rows(self.X, sample), **weights)
 
     def held_out(self, model: AffineNRSfM) -> tuple[NDArray, float]:
         """Return squared errors and signals (n, J, 2) of held-out points, and optimism.
@@ -814,8 +803,7 @@ class _Fit(NamedTuple):
 
     def clearly_better(self, other: "_Fit", robust: bool) -> bool:
         """Return whether points of new frames have clearly smaller errors."""
-        fits = other, self
-        pairs = np.stack([fit.optimism * fit.squares[..., 0] for fit in fits])
+        pairs = np.stack([f.optimism * f.squares[..., 0] for f in (other, self)])
         pairs = pairs[:, np.isfinite(pairs.sum(axis=0)).any(axis=1)]
         gain = np.subtract(*(np.nanmedian if robust else np.nanmean)(pairs, axis=2))
         return len(gain) > 0 and gain.mean() > CLEAR * gain.std() / np.sqrt(len(gain))
@@ -901,8 +889,7 @@ def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
 def _with_face_prior(model: AffineNRSfM, rows: _Rows) -> dict[str, Any]:
     """Return the parameters of a fit with the face prior."""
     K = FACE_COMPONENTS if model.n_components == AUTO else model.n_components
-    prior = load_face_prior(K, layout=rows.face_layout)
-    return {"prior": prior, "n_components": AUTO}
+    return {"prior": load_face_prior(K, layout=rows.face_layout), "n_components": AUTO}
 
 
 def _consensus(best: _Fit, rows: _Rows) -> Proposal:
@@ -932,8 +919,7 @@ def _orthographic(best: _Fit, rows: _Rows) -> Proposal:
 
 def _affine(best: _Fit, rows: _Rows) -> Proposal:
     """Affine cameras absorb the stretch of images."""
-    ratio = best.model.camera_noise_ratio_
-    if best.model.prior or not ratio >= advice.OTHER_CAMERAS:
+    if best.model.prior or not best.model.camera_noise_ratio_ >= advice.OTHER_CAMERAS:
         return "not stretched"
     plain = dict.fromkeys(("focal_length", "principal_point"))
     return {"camera": "affine", "refinement": "joint"} | plain
@@ -970,7 +956,7 @@ def decided(
     """
     sample = spread(np.arange(X.shape[0]), MOST_ROWS)
     row_weights = {name: np.asarray(each)[sample] for name, each in weights.items()}
-    X_sample = taken_rows(X, sample)
+    X_sample = scikit_learn.taken_rows(X, sample)
     layout = face_layout or ""
     if "prior" in free and not layout:
         layout = _layout_name(estimator, X_sample)
