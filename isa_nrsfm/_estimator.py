@@ -1110,9 +1110,8 @@ default="affine"
         table = tables.open_table(X, layout, names, counted=reset, n_jobs=self.n_jobs)
         for share in self._focal_shares(table):
             # As cameras with the mean focal length would show the rows
-            moved = partial(
-                camera_models.zoomed, centre=np.reshape(self.principal_point, (2, 1))
-            )
+            centre = np.reshape(self.principal_point, (2, 1))
+            moved = partial(camera_models.zoomed, centre=centre)
             table = table.derive(moved, share[..., None])
         weights: tuple[NDArray, ...] = ()
         if point_weight is not None:

@@ -96,7 +96,6 @@ NO_PERSPECTIVE = (
     "no perspective was found: the focal length is very long, or there are too few "
     "basis shapes to estimate it. If it is known, give focal_length"
 )
-WEAK = "The fit is that of weak-perspective cameras"
 
 
 class TableFit(NamedTuple):
@@ -848,7 +847,7 @@ def fit_perspective(table: Images, n_components: int | None, given: Any) -> Tabl
         why = "" if error < of_weak else NOT_BETTER
     table.progress(PERSPECTIVE_STAGE)
     if why:
-        warn_caller(f"{why}. {WEAK}")
+        warn_caller(f"{why}. The fit is that of weak-perspective cameras")
         return plain()
     for each in caught:
         warn_caller(str(each.message), each.category)
