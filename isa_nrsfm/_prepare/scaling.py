@@ -133,10 +133,7 @@ def check_size(
     if n_components > largest:
         possible = f"at least 7 points are needed for {named('n_components', 1)}"
         if largest > 0:
-            possible = (
-                f"with {n_points} points the largest possible {named('n_components')} "
-                f"is {largest}"
-            )
+            possible = f"the largest possible {named('n_components')} is {largest}"
         if largest > 0 and camera == "affine":
             n_max = largest_n_components(n_points, "weak_perspective")
             possible += (
