@@ -167,25 +167,28 @@ def centred_frames(rows: NDArray) -> tuple[NDArray, FrameReport]:
     # Coordinates are equal up to four units in the last place of the largest one.
     eps = 4 * np.finfo(rows.dtype).eps
     seen = seen_points(rows)
-    n_seen, hidden = seen.sum(axis=1), ~seen[:, None]
+    n_seen, hidden = seen.sum(axis=1), None if seen.all() else ~seen[:, None]
     centred = np.array(rows, dtype=float, order="C")
-    np.copyto(centred, 0.0, where=hidden)
+    if hidden is not None:
+        np.copyto(centred, 0.0, where=hidden)
     translation = np.full((len(rows), 2), np.nan)
     total, visible = centred.sum(axis=2), n_seen[:, None] > 0
     np.divide(total, n_seen[:, None], where=visible, out=translation)
     centred -= translation[:, :, None]
-    np.copyto(centred, 0.0, where=hidden)
+    if hidden is not None:
+        np.copyto(centred, 0.0, where=hidden)
     x, y = centred.swapaxes(0, 1)
     xx, yy = np.vecdot(x, x), np.vecdot(y, y)
     square, place = xx + yy, np.linalg.norm(translation, axis=1)
     in_one_place = (n_seen > 0) & (square <= n_seen * (eps * place) ** 2)
-    # Twice the square of the distances from the principal axis, roughly
-    scatter = square - np.hypot(xx - yy, 2.0 * np.vecdot(x, y))
-    on_line = scatter <= 4 * n_seen * (eps * place) ** 2 + 1e-6 * square
-    on_line &= ~seen.all(axis=1)
-    candidates = centred[on_line], place[on_line], n_seen[on_line]
-    on_line[on_line] = _collinear(*candidates, eps)
-    np.copyto(centred, np.nan, where=hidden)
+    on_line = np.zeros(len(rows), dtype=bool)
+    if hidden is not None:
+        # Twice the square of the distances from the principal axis, roughly
+        scatter = square - np.hypot(xx - yy, 2.0 * np.vecdot(x, y))
+        near = scatter <= 4 * n_seen * (eps * place) ** 2 + 1e-6 * square
+        part = near & ~seen.all(axis=1)
+        on_line[part] = _collinear(centred[part], place[part], n_seen[part], eps)
+        np.copyto(centred, np.nan, where=hidden)
     size = np.sqrt(square / (2 * np.maximum(n_seen, 1)))
     return centred, FrameReport(translation, size, n_seen, in_one_place, on_line)
 
