@@ -330,6 +330,7 @@ def facts(**known):
 UNKNOWN = {
     "deformation": DepthCertainty(1.4, 1.0),
     "parts": DepthCertainty(0.9, 1e-6),
+    "doubtful": DepthCertainty(0.45, 1e-6),
     None: DepthCertainty(0.1, 1e-6),
 }
 
@@ -357,8 +358,10 @@ class TestAdvice:
                 assert len(found) == 1
                 assert COMPARE not in text
                 continue
-            missing = depth is not None and camera != "affine"
-            assert ("depth of the shapes is not" in text) == missing
+            known = camera == "affine" or depth is None
+            state = "doubtful" if depth == "doubtful" else "not determined"
+            assert (f"depth of the shapes is {state}" in text) == (not known)
+            assert not (known or depth == "doubtful") or "are withheld" not in text
             bent = "wrong points: they bend the shapes. Correct them"
             assert text.startswith(bent) == (share > 0)
             assert not (share > 0 and "n_components" in text)

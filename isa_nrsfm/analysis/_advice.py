@@ -34,8 +34,8 @@ SAME_UNIT = (
 # above which it is poor; errors of depths likewise, of which the second withholds them.
 # Few points and frames: docs/benchmarks/README.md, "Thresholds".
 FIT, DEPTH = (0.02, 0.2), (0.2, LARGEST_SHARE)
-# Error of depths above which most true ones were larger: docs/depth.md, "Undetermined
-# depth".
+# Error of depths above which every second one was in truth above `LARGEST_SHARE`:
+# docs/depth.md, "Undetermined depth".
 DOUBTFUL = 0.4
 FEW_POINTS = 10
 # What to do if other settings may be better; the command line does it by itself.
@@ -194,7 +194,7 @@ def depth_advice(facts: Facts) -> str:
     error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
     state, result = "not determined", "Angles and proportions are withheld"
     if certainty.determined:
-        error += ", and larger for most such fits in tests"
+        error += f", and over {100 * LARGEST_SHARE:.0f} % in half of such fits in tests"
         state, result = "doubtful", "Compare angles and proportions with known ones"
     text = f"the depth of the shapes is {state}: {error}"
     if facts.bent:
