@@ -105,7 +105,6 @@ class TestMinimum:
     def test_objective_rises_in_every_direction(self, camera, kind):
         scene = scene_of(camera, kind)
         fits = fitted(scene, camera)
-        assert fits.converged.all()
         if camera != "affine":
             assert_calibrated(fits.motion, camera)
         rest = scene.tracks - images(scene.shapes, *camera_and_alpha(fits))
@@ -281,7 +280,6 @@ class TestExact:
             camera_and_alpha(fits), camera_and_alpha(scene), strict=True
         ):
             assert_allclose(got, true, atol=1e-8)
-        assert fits.converged.all()
         assert_allclose(fits.objective, 0, atol=1e-9)
 
 
@@ -375,7 +373,6 @@ class TestDegenerate:
         fits = fitted(scene._replace(shapes=scene.shapes[:1]), camera)
         assert fits.alpha.shape == (20, 0)
         assert fits.covariance.shape == (20, 0, 0)
-        assert fits.converged.all()
         if camera == "affine":
             W = scene.centred.swapaxes(1, 2)
             expected = W @ np.linalg.pinv(scene.shapes[0])
@@ -398,7 +395,6 @@ class TestDegenerate:
             finite = np.isfinite(each.reshape(8, -1))
             assert_array_equal(finite.all(axis=1), expected)
             assert_array_equal(finite.any(axis=1), expected)
-        assert not fits.converged[~expected].any()
 
     @pytest.mark.parametrize("variance", [0.0, NOISE**2])
     def test_all_points_of_a_frame_equal(self, camera, variance):

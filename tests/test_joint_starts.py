@@ -133,7 +133,8 @@ def started(scene, camera, problem=None):
     problem = problem or problem_of(scene)
     paper = paper_shapes(factors)
     table = FactorisedTable(*[None] * 5, scene.W, [], factors)
-    return best_starts(problem, table, paper, CAMERAS[camera])
+    problem = replace(problem, seen_by=CAMERAS[camera])
+    return best_starts(problem, table, paper)
 
 
 @pytest.mark.parametrize(
@@ -181,8 +182,8 @@ def test_no_other_basis_is_likelier(penalty):
 def test_the_likeliest_fit_of_the_starts_counts():
     scene = random_scene(amplitude=0.6, noise=0.02)
     problem, factors = problem_of(scene), scene.factors
-    camera, states = CAMERAS["orthographic"], started(scene, "orthographic", problem)
-    ends = [problem.unreversed(state, camera).history[-1] for state in states]
+    states = started(scene, "orthographic", problem)
+    ends = [problem.unreversed(state).history[-1] for state in states]
     table = FactorisedTable(*[None] * 5, scene.W, [], factors)
     fit, _ = _first_fit(problem, table, paper_shapes(factors))
     assert max(ends) > min(ends)
@@ -273,8 +274,8 @@ class TestWholeDistribution:
         fit = problem.refined(state, max_iter=5)
         n = n_directions(problem, FEW_POINTS, few=False)
         assert n == 12  # half of 2,880 coordinates, less 8 a frame, over 36, less one
-        wide = extended(problem, fit, n)
-        found, _ = whole_distribution(problem, wide)
+        wide = extended(problem, fit.state, n)
+        found = whole_distribution(problem, wide.state)
         assert found.state.noise > 0.5 * NOISE**2
 
 
@@ -403,19 +404,18 @@ def test_noise_of_the_fit_is_the_most_evident():
     problem = replace(problem, frames=frames, settings=settings)
     motion, noise = tracks.motion, 0.01 * problem.mean_square
     start = JointState(lifted_shapes(rows, motion, 4), motion, noise)
-    fit, widths = whole_distribution(problem, problem.refined(start, max_iter=30))
+    fit = whole_distribution(problem, problem.refined(start, max_iter=30).state)
     values = []
     for factor in 0.8, 1.0, 1.25:
         state = fit.state._replace(noise=factor * fit.state.noise)
-        other = fit._replace(state=state, widths=widths)
-        values.append(evidence(problem, other))
+        values.append(evidence(problem, fit._replace(state=state)))
     assert values[1] == min(values)
     assert_allclose(values[0], values[2], atol=0.5 * (values[0] - values[1]))
     # It does not depend on the axes of the object.
     shapes, motion, noise = fit.state
     turn = Rotation.from_rotvec([0.3, -1.0, 0.5]).as_matrix()
     turned = fit._replace(state=JointState(turn @ shapes, motion @ turn.T, noise))
-    for own in (widths, None):
+    for own in (fit.widths, None):
         found = [evidence(problem, each._replace(widths=own)) for each in (fit, turned)]
         assert_allclose(found[1], found[0], rtol=1e-9)
 

@@ -131,7 +131,7 @@ def test_a_width_of_zero_gives_the_shapes_of_the_prior(frontal):
     # Also in float64 the mean shape moves by the square of the width.
     prior = problem.settings.shape_prior._replace(width=1e-5)
     problem = problem.with_prior(prior)
-    shapes = problem.unreversed(start, problem.cameras).state.shapes
+    shapes = problem.unreversed(start).state.shapes
     assert_allclose(shapes, prior.shapes, atol=1e-6)
 
 
@@ -141,7 +141,7 @@ def test_the_first_width_makes_no_difference(frontal):
         problem, start = problem_of(frontal)
         prior = problem.settings.shape_prior._replace(width=width)
         problem = problem.with_prior(prior)
-        fit = widened(problem, problem.unreversed(start, problem.cameras))
+        fit = widened(problem, problem.unreversed(start))
         ends.append((fit.prior.width, fit.state.shapes))
     (few, some), (many, other) = ends
     assert few == pytest.approx(many, rel=0.02)

@@ -94,13 +94,8 @@ class AffineCameras:
         return np.zeros(1)
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
-        """Return inverse curvatures, for `product`, of curvatures (6, n) per row."""
+        """Return inverses (3, 3, n) of curvatures (6, n), the same for each row."""
         return linalg.inverse3(curvature)
-
-    def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
-        """Return vectors (p, n) times an inverse curvature."""
-        rows = vector.reshape(len(vector) // 3, 3, vector.shape[1])
-        return np.einsum("abn,rbn->ran", inverse, rows).reshape(vector.shape)
 
     def largest_length(self, step: NDArray) -> float:
         """Return the largest step length, one for all cameras, along a direction."""
@@ -166,7 +161,10 @@ class CalibratedCameras:
         return np.asarray(second[linalg.pair_indices(len(gradient))])
 
     def inverse_curvature(self, M: NDArray, curvature: NDArray) -> NDArray:
-        """Return inverses (p, p, n); a scale without curvature does not move."""
+        """Return inverses (p, p, n) of curvatures (6, n) of each row.
+
+        A scale without curvature does not move.
+        """
         C = linalg.unpacked(self.curvature(M, curvature))
         turns = C[linalg.ROWS, linalg.COLUMNS]
         turns[linalg.DIAGONAL] += 1e-9 * turns[linalg.DIAGONAL].mean(axis=0)
@@ -182,10 +180,6 @@ class CalibratedCameras:
         C[:3, 3] = C[3, :3] = -inverse_pivot * turn
         C[3, 3] = inverse_pivot
         return C
-
-    def product(self, inverse: NDArray, vector: NDArray) -> NDArray:
-        """Return vectors (p, n) times the inverse curvature."""
-        return np.einsum("abn,bn->an", inverse, vector)
 
     def largest_length(self, step: NDArray) -> float:
         """Return the step length at which a camera moves by the largest turn."""
@@ -298,6 +292,17 @@ def residuals(
     """Return points (n, 2, J) minus their images at position zero."""
     model = stacked_motion(motion, alpha) @ shapes.reshape(-1, shapes.shape[2])
     return rows - model.reshape(rows.shape)
+
+
+def centred_residuals(
+    rows: NDArray, weights: NDArray, *model: NDArray
+) -> NDArray[np.float64]:
+    """Return `residuals` less their weighted mean; weights (n, J), zero if missing."""
+    residual = residuals(rows, *model)
+    total = weights.sum(axis=1)[:, None]  # zero where no point counts
+    position = np.einsum("ij,icj->ic", weights, np.nan_to_num(residual))
+    residual -= (position / np.where(total > 0, total, 1.0))[..., None]
+    return residual
 
 
 def stacked_motion(motion: NDArray, alpha: NDArray) -> NDArray:

@@ -299,6 +299,13 @@ class FrameModel:
         """The search for frames, shared by all tables."""
         return FrameSearch(self.shapes, CAMERAS[self.camera])
 
+    def with_shapes(self, shapes: NDArray, noise: float, alpha: NDArray) -> Self:
+        """Return the model of other shapes, with coefficients (n, K) of frames."""
+        starts, gauge = spread_starts(alpha), FrameMap.identity(len(shapes) - 1)
+        return replace(
+            self, shapes=shapes, noise_variance=noise, starts=starts, gauge=gauge
+        )
+
     @cached_property
     def without_starts(self) -> "FrameModel":
         """The model that fits each frame from zero only."""

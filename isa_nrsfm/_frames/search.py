@@ -446,7 +446,6 @@ class FramePosterior(NamedTuple):
     exp(hat(w))``, with the uncertainty of the coefficients. NaN for affine cameras.
     objective (I,): ``sum_j w_ij ||m_ij - M S_j - t||^2 + s2 |a|^2``, to 1e-12 of the
     energy.
-    converged (I,): whether the last Newton step was below the convergence tolerance.
     """
 
     motion: NDArray
@@ -455,7 +454,6 @@ class FramePosterior(NamedTuple):
     covariance: NDArray
     turn_covariance: NDArray
     objective: NDArray
-    converged: NDArray
 
     @classmethod
     def unknown(
@@ -464,8 +462,7 @@ class FramePosterior(NamedTuple):
         """Return fits of NaN, to be filled in, with or without covariances."""
         size = n_components if covariances else 0
         shapes = (2, 3), (2,), (n_components,), (size, size), (3, 3), ()
-        parts: list[Any] = [np.full((n_frames, *shape), np.nan) for shape in shapes]
-        return cls._make([*parts, np.zeros(n_frames, dtype=bool)])
+        return cls._make(np.full((n_frames, *shape), np.nan) for shape in shapes)
 
     def take(self, frames: NDArray) -> Self:
         """Return the fits of some of the frames."""
@@ -548,8 +545,7 @@ class FrameSearch:
         """
         n_frames, n_components = len(rows), len(self.shared.shapes) - 1
         noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
-        point_weights = 1.0 if weights is None else weights
-        weights = np.where(seen_points(rows), point_weights, 0.0)
+        weights = np.where(seen_points(rows), 1.0 if weights is None else weights, 0.0)
         complete = (weights == 1.0).all(axis=1)
         fits = FramePosterior.unknown(n_frames, n_components, covariances)
         fit = partial(self.fit, starts=starts, covariances=covariances)
@@ -585,8 +581,8 @@ class FrameSearch:
         noise = np.broadcast_to(np.asarray(noise, dtype=float), (n_frames,))
         length = n_together(n_components + 1)
 
-        def minima(chosen: NDArray, initial: NDArray) -> FramePosterior:
-            """Return the minima that frames reach from coefficients (n_chosen, K)."""
+        def searched(chosen: NDArray, initial: NDArray) -> FramePosterior:
+            """Return the fits that frames reach from coefficients (n_chosen, K)."""
             fits = FramePosterior.unknown(len(chosen), n_components, covariances)
             for first in range(0, len(chosen), length):
                 block = padded(np.arange(first, min(first + length, len(chosen))))
@@ -598,8 +594,8 @@ class FrameSearch:
                         block, products = block[usable], of_frames(products, usable)
                 problem = self.problem(products, noise[chosen[block]])
                 start = self.start(problem, initial[block].T)
-                M, converged = self.descend(problem, start, MAX_STEPS)
-                M, posterior = self._unreversed(problem, M, converged)
+                M = self.descend(problem, start, MAX_STEPS)
+                M, posterior = self._unreversed(problem, M)
                 covariance, turns = fits.covariance[block], fits.turn_covariance[block]
                 if covariances:
                     spreads = self._covariances(problem, M, posterior)
@@ -607,31 +603,30 @@ class FrameSearch:
                     turns = self.space.T @ turns @ self.space
                 motion, alpha = frames_first(M), posterior.alpha.T
                 places = products.positions(motion, alpha)
-                kept = covariance, turns, posterior.objective, converged
+                kept = covariance, turns, posterior.objective
                 fit = FramePosterior(motion @ self.space, places, alpha, *kept)
                 fits.put(block, fit)
             return fits
 
         initial = np.zeros((n_frames, n_components)) if initial is None else initial
-        fits = minima(np.arange(n_frames), initial)
-        if starts is None or not len(starts):
-            return fits
+        fits = searched(np.arange(n_frames), initial)
         # Further starts for frames with large residuals, all starts at once. At the
         # minimum, f / s2 is the squared Mahalanobis distance of a frame from the model.
         # It is chi-squared distributed, with two degrees of freedom per point minus the
         # eight of camera and position. The threshold is three times its expectation.
         limit = 3.0 * noise * np.maximum(2.0 * frames.weight - 8.0, 1.0)
         poor = np.flatnonzero(fits.objective > limit)
-        if len(poor):
-            initial = np.repeat(starts, len(poor), axis=0)
-            restarts = minima(np.tile(poor, len(starts)), initial)
-            # Of equal minima, keep the first.
-            objective = restarts.objective.reshape(len(starts), -1)
-            best = np.argmax(objective <= (1 + EQUAL) * objective.min(axis=0), axis=0)
-            best = best * len(poor) + np.arange(len(poor))
-            gain = fits.objective[poor] - restarts.objective[best]
-            better = gain > EQUAL * fits.objective[poor]
-            fits.put(poor[better], restarts.take(best[better]))
+        if starts is None or not len(starts) or not len(poor):
+            return fits
+        initial = np.repeat(starts, len(poor), axis=0)
+        restarts = searched(np.tile(poor, len(starts)), initial)
+        # Of equal minima, keep the first.
+        objective = restarts.objective.reshape(len(starts), -1)
+        best = np.argmax(objective <= (1 + EQUAL) * objective.min(axis=0), axis=0)
+        best = best * len(poor) + np.arange(len(poor))
+        gain = fits.objective[poor] - restarts.objective[best]
+        better = gain > EQUAL * fits.objective[poor]
+        fits.put(poor[better], restarts.take(best[better]))
         return fits
 
     def problem(self, products: FrameSums, variance: NDArray) -> FrameProblem:
@@ -647,11 +642,11 @@ class FrameSearch:
         # The cameras may not be at their minimum yet: compare minima with minima. With
         # 3, 6 and 12 steps 22, 7 and 1 % of reversed frames of motion capture remain.
         n_steps = 6
-        M, _ = self.descend(problem, self.evaluate(problem, M), n_steps)
+        M = self.descend(problem, self.evaluate(problem, M), n_steps)
         # Shapes that are not fitted yet can explain a reversed frame well: try all.
         value = coefficient_posterior(problem, M).value(problem[1])
         every = np.arange(len(motion))
-        M, better, _ = self._better_reversed(problem, M, value, every, n_steps)
+        M, better = self._better_reversed(problem, M, value, every, n_steps)
         motion = motion.copy()
         motion[better] = frames_first(M[:, :, better]) @ self.space
         return motion, better
@@ -665,7 +660,7 @@ class FrameSearch:
         """
         M = frames_last(motion @ self.space.T)
         value = coefficient_posterior(problem, M).value(problem[1])
-        M, _ = self.descend(problem, self.evaluate(problem, M * REVERSED), 30)
+        M = self.descend(problem, self.evaluate(problem, M * REVERSED), 30)
         posterior = coefficient_posterior(problem, M)
         rise = (posterior.value(problem[1]) - value) / problem[1]
         return frames_first(M) @ self.space, posterior.alpha.T, rise
@@ -707,19 +702,18 @@ class FrameSearch:
         return State(M, posterior.value(noise), -gradient, definite, hessian), through
 
     def _unreversed(
-        self, problem: FrameProblem, M: NDArray, converged: NDArray
+        self, problem: FrameProblem, M: NDArray
     ) -> tuple[NDArray, CoefficientPosterior]:
         """Return cameras (2, 3, n), or minima from reversed ones where these are lower.
 
-        With their posterior. Sets where the search for the latter has converged.
+        With their posterior.
         """
         posterior = coefficient_posterior(problem, M)
         if not self.model.calibrated:
             return M, posterior
         value, rise = posterior.value(problem[1]), _rise(problem, M, posterior)
         tried = np.flatnonzero(~(rise > LARGE_RISE * value))
-        M, better, reached = self._better_reversed(problem, M, value, tried, MAX_STEPS)
-        converged[better] = reached[better]
+        M, better = self._better_reversed(problem, M, value, tried, MAX_STEPS)
         return M, coefficient_posterior(problem, M) if better.any() else posterior
 
     def _covariances(
@@ -747,27 +741,25 @@ class FrameSearch:
         value: NDArray,
         tried: NDArray,
         max_steps: int,
-    ) -> tuple[NDArray, NDArray, NDArray]:
+    ) -> tuple[NDArray, NDArray]:
         """Return cameras (2, 3, n), or minima from reversed ones where these are lower.
 
         Cameras M have the objectives value (n,); the indices of those to reverse are
-        `tried`. Also returns masks (n,) of replaced cameras and of searches that
-        converged.
+        `tried`. Also returns a mask (n,) of replaced cameras.
         """
         limit = value - 1e-10 * scale_of(problem)
-        cameras, (better, converged) = M.copy(), np.zeros((2, len(value)), dtype=bool)
+        cameras, better = M.copy(), np.zeros(len(value), dtype=bool)
         tried = padded(tried)
         if len(tried):
             problem, M, limit = of_frames((problem, M, limit), tried)
             start = self.evaluate(problem, M * REVERSED)
             # The reversed camera and M differ in the third column.
             radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])
-            minima = M, limit, radius
-            other, converged[tried] = self.descend(problem, start, max_steps, minima)
+            other = self.descend(problem, start, max_steps, (M, limit, radius))
             reached = coefficient_posterior(problem, other).value(problem[1])
             better[tried] = lower = reached < limit
             cameras[..., tried] = np.where(lower, other, M)
-        return cameras, better, converged
+        return cameras, better
 
     def descend(
         self,
@@ -775,13 +767,12 @@ class FrameSearch:
         state: State,
         max_steps: int,
         minima: Minima | None = None,
-    ) -> tuple[NDArray, NDArray]:
-        """Minimise the objectives; return iterates (..., n) and convergence (n,).
+    ) -> NDArray:
+        """Minimise the objectives; return iterates (..., n).
 
         Gives up a frame that is not expected to end below its known minimum.
         """
-        n_frames = len(state.value)
-        ends, converged = state.position.copy(), np.zeros(n_frames, dtype=bool)
+        n_frames, ends = len(state.value), state.position.copy()
         running, damping = np.arange(n_frames), np.zeros(n_frames)
         for n_left in range(max_steps, -1, -1):
             # Next step, and convergence test by its predicted decrease. Convergence is
@@ -799,9 +790,8 @@ class FrameSearch:
             if leaving.any():
                 last = self.model.moved(state.position, np.where(small, step, 0.0))
                 ends[..., running[leaving]] = last[..., leaving]
-                converged[running[leaving]] = small[leaving]
                 if leaving.all():
-                    return ends, converged
+                    return ends
                 left = padded(np.flatnonzero(~leaving))
                 problem, state, step, running, damping, minima = of_frames(
                     (problem, state, step, running, damping, minima), left
@@ -820,7 +810,7 @@ class FrameSearch:
                     new[..., worse] = old[..., worse]
             state, damping = trial, eased
         ends[..., running] = state.position
-        return ends, converged
+        return ends
 
     def step(self, state: State, damping: NDArray) -> tuple[NDArray, NDArray]:
         """Return Newton steps (p, n) and the damping (n,) that makes them definite."""

@@ -23,13 +23,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import full_rotations
-from isa_nrsfm._frames.models import FrameMap, FrameModel, spread_starts
+from isa_nrsfm._frames.camera_models import compose, full_rotations
+from isa_nrsfm._frames.models import FrameModel
 from isa_nrsfm._joint.consensus import (
     LEFT,
     MOST_COMPONENTS,
     MOST_POINTS,
     aligning_rotations,
+    frames_showing,
     interpolation,
     principal_shapes,
 )
@@ -40,7 +41,7 @@ from isa_nrsfm._joint.uncertainty import N_GROUPS, inlying_rows, neighbours
 from isa_nrsfm._joint.whole import LEAST_NOISE, determined
 from isa_nrsfm._linalg import centred
 from isa_nrsfm._prepare.scaling import ScaledTable
-from isa_nrsfm._tables import FEWEST_POINTS, FrameBlocks, spread
+from isa_nrsfm._tables import spread
 
 # Largest numbers of frames and directions, and steps, and largest squared error of the
 # depths by other explanations: docs/benchmarks/README.md, "Thresholds".
@@ -73,21 +74,20 @@ def bagged(
 
     def fitted(points: NDArray) -> tuple[NDArray, NDArray]:
         """Return the frames that show enough of the points, and their depths."""
-        seen = np.isfinite(part[:, 0, points]).sum(axis=1)
-        frames = np.flatnonzero(seen >= FEWEST_POINTS)
-        problem = _problem(part, w, settings, frames, points)
+        frames = frames_showing(part[:, :, points])
+        counts = None if w is None else w[np.ix_(frames, points)]
+        tracks = JointFrames.of_rows(part[np.ix_(frames, range(2), points)], counts)
         part_widths = widths.of_points(len(points), n_directions)
-        problem = replace(problem, widths=part_widths)
+        problem = JointProblem(tracks, settings, widths=part_widths)
         shapes = centred(model.shapes[: n_directions + 1, :, points])
         state = JointState(shapes, fit.motion[frames], model.noise_variance)
         limits: Any = {"max_iter": MOST_STEPS, "tol": settings.tol}
         state = problem.refined(state, least_noise=LEAST_NOISE, **limits).state
-        depths = centred(state.depths(problem.likelihood(*state).alpha))
-        return frames, depths
+        return frames, centred(state.depths(problem.likelihood(*state).alpha))
 
     # Depths of the joint fit, and changes of them
     rotations, scales = full_rotations(fit.motion)
-    S = model.shapes[0] + np.tensordot(fit.alpha, model.shapes[1:], 1)
+    S = compose(model.shapes[0], model.shapes[1:], fit.alpha)
     z = scales[:, None] * np.einsum("ia,iaj->ij", rotations[:, 2], S[:, :, chosen])
     frames, depths = fitted(chosen)
     z[frames] = depths * np.copysign(1.0, np.sum(depths * z[frames]))
@@ -111,28 +111,8 @@ def bagged(
     R = aligning_rotations(centred(S[:, :, chosen]), noise)
     n_max = min(3 * n_points - 7, MOST_COMPONENTS)
     shapes, _, remainder = principal_shapes(centred(R.mT @ S), n_max, LEFT * noise)
-    problem = _problem(part, w, settings, np.arange(len(part)), np.arange(n_points))
+    problem = JointProblem(JointFrames.of_rows(part, w), settings)
     state = JointState(shapes, fit.motion @ R, noise)
     state, widths = determined(problem, state, None)
     alpha = replace(problem, widths=widths).likelihood(*state).alpha
-    gauge = FrameMap.identity(len(state.shapes) - 1)
-    starts, noise = spread_starts(alpha), noise + remainder
-    model = replace(
-        model, shapes=state.shapes, noise_variance=noise, starts=starts, gauge=gauge
-    )
-    return model, widths
-
-
-def _problem(
-    rows: NDArray,
-    weights: NDArray | None,
-    settings: FitSettings,
-    frames: NDArray,
-    points: NDArray,
-) -> JointProblem:
-    """Return the problem of some frames and points of rows (n, 2, J)."""
-    rows = rows[np.ix_(frames, np.arange(2), points)]
-    blocks = FrameBlocks.of_array(rows, len(rows))
-    counts = None if weights is None else weights[np.ix_(frames, points)]
-    complete = bool(np.isfinite(rows).all())
-    return JointProblem(JointFrames.from_points(blocks, complete, counts), settings)
+    return model.with_shapes(state.shapes, noise + remainder, alpha), widths

@@ -44,12 +44,13 @@ from isa_nrsfm._compat.scikit_learn import one_blas_thread
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
     AffineCameras,
+    compose,
     full_rotations,
     residuals,
     rotated,
     turning,
 )
-from isa_nrsfm._frames.models import NOT_ESTIMATED, FrameMap, FrameModel, spread_starts
+from isa_nrsfm._frames.models import NOT_ESTIMATED, FrameModel
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import JointFit, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
@@ -69,7 +70,7 @@ from isa_nrsfm._linalg import (
     unpacked,
 )
 from isa_nrsfm._prepare.scaling import ScaledTable
-from isa_nrsfm._tables import FEWEST_POINTS, FrameBlocks, spread
+from isa_nrsfm._tables import FEWEST_POINTS, spread
 
 # Frames and points of a group
 Indices = tuple[NDArray, NDArray]
@@ -277,7 +278,7 @@ def consensus(
     """
     part, fit, _ = inlying_rows(model, table.rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
-    shapes = model.shapes[0] + np.tensordot(fit.alpha, model.shapes[1:], 1)
+    shapes = compose(model.shapes[0], model.shapes[1:], fit.alpha)
     rotations, scales = full_rotations(fit.motion)
     first = scales[:, None, None] * rotations @ shapes
     first[:, :2] += fit.translation[:, :, None]
@@ -305,17 +306,13 @@ def consensus(
         if settings.on_step is not None:
             settings.on_step()
         if result is not None:
-            groups.append(Group(points, weight, *result)._replace(start=start))
+            groups.append(Group(points, weight, *result, start))
     n_max = min(3 * n_points - 7, MOST_COMPONENTS)
 
     def modelled(S: NDArray, noise: float) -> FrameModel:
         """Return the model of shapes (I, 3, J): their principal components."""
         found, alpha, remainder = principal_shapes(S, n_max, LEFT * noise)
-        starts, gauge = spread_starts(alpha), FrameMap.identity(len(found) - 1)
-        noise += remainder
-        return replace(
-            model, shapes=found, noise_variance=noise, starts=starts, gauge=gauge
-        )
+        return model.with_shapes(found, noise + remainder, alpha)
 
     if not groups:
         return replace(modelled(shapes, noise), certainty=certainty)
@@ -416,8 +413,8 @@ def disagreements(groups: list[Group], depths: NDArray) -> NDArray:
 
 def seen_by(model: FrameModel, state: JointState, rows: NDArray) -> NDArray:
     """Return the cameras (I, 2, 3) with which a fit from another start sees rows."""
-    shapes, starts = state.shapes, np.empty((0, len(state.shapes) - 1))
-    other = replace(model, shapes=shapes, noise_variance=state.noise, starts=starts)
+    none = np.empty((0, len(state.shapes) - 1))
+    other = model.with_shapes(state.shapes, state.noise, none)
     return other.posterior(rows, covariances=False).motion
 
 
@@ -440,14 +437,13 @@ def group_fits(
         for points, count in neighbourhoods(distances, size)
         for start, (share, _) in enumerate(starts)
     ]
-    rows, first = scene.rows, scene.first
     # What other processes need: no other fits
     quiet = settings._replace(on_step=None, start=None, placed=None, known=None)
     # In the order of memory that pickled arrays have, else rounding errors differ.
     parts = (
         scene._replace(
-            rows=rows.take(points, 2),
-            first=first.take(points, 2),
+            rows=scene.rows.take(points, 2),
+            first=scene.first.take(points, 2),
             motion=starts[start][1],
         )
         for points, _, start in tasks
@@ -508,8 +504,7 @@ def group_fit(
     noise = max(0.1 * float(np.mean((rows - motion @ shapes[0]) ** 2)), scene.floor)
     start = JointState(shapes, motion, noise)
     # Fixed cameras, without the prior, which would make basis shapes vanish
-    blocks = FrameBlocks.of_array(tracks, len(tracks))
-    part = JointFrames.from_points(blocks, bool(seen.all()))
+    part = JointFrames.of_rows(tracks)
     free, (n_seen, square) = MarginalLikelihood(part), part.totals
     least_noise, tol = scene.floor * n_seen / square, 0.3 * settings.tol
     refined = partial(refine_joint, least_noise=least_noise, tol=tol)
@@ -524,7 +519,7 @@ def group_fit(
     alpha = likelihood(*state).alpha
     rotations, scales = full_rotations(state.motion)
     turned = scales[:, None, None] * rotations
-    S = turned @ (state.shapes[0] + np.tensordot(alpha, state.shapes[1:], 1))
+    S = turned @ compose(state.shapes[0], state.shapes[1:], alpha)
     # Positions from the visible points, and the mirror image nearest to the joint fit
     sums = np.where(seen[:, None], tracks - S[:, :2], 0.0).sum(axis=2)
     S[:, :2] += (sums / seen.sum(axis=1)[:, None])[:, :, None]

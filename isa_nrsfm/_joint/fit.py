@@ -22,7 +22,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CAMERAS, CameraModel, residuals
+from isa_nrsfm._frames.camera_models import (
+    CAMERAS,
+    CameraModel,
+    centred_residuals,
+    residuals,
+)
 from isa_nrsfm._frames.models import (
     LEAST_POINTS,
     FrameModel,
@@ -37,7 +42,6 @@ from isa_nrsfm._joint.problem import (
     JointFit,
     JointProblem,
     JointState,
-    Widths,
     regular,
 )
 from isa_nrsfm._joint.settings import FitSettings
@@ -109,53 +113,37 @@ def fit_jointly(
     """
     every_point = table.scaled.complete and table.scaled.weights is None
     problems = _problems(table, paper_shapes, settings)
-    first = next(problems)
-    whole = settings.all_directions
+    first, whole = next(problems), settings.all_directions
+    few_directions = partial(n_directions, first, paper_shapes.shape[2])
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is not None:
-        start = start._replace(shapes=first.frames.coordinates(start.shapes))
+        start = _of_sample(first, table, start)
         if not len(start.motion):
             start = first.aligned(start)
-        elif table.parts:
-            start = start._replace(motion=start.motion[table.parts[0]])
         if settings.prior is None:  # a fit without the prior has larger basis shapes
             start = with_prior(first, start)
         # The widths of a prior change its first fit. All directions have another one.
         rough: dict[str, Any] = {"max_iter": 0} if whole else {}
         if settings.prior is not None:
             rough = {"tol": settings.tol / TOL_SHARE}
-        fit = first.unreversed(start, first.cameras, **rough)
+        fit = first.unreversed(start, **rough)
         if whole:
-            n = n_directions(first, paper_shapes.shape[2], few=True)
-            fit = extended(first, fit, n)
+            fit = extended(first, fit.state, few_directions(few=True))
     elif whole:
         fit = _likeliest_fit(first, table, paper_shapes)
     else:
         fit, start = _first_fit(first, table, paper_shapes)
-    ratio, penalty, rivals = fit.camera_noise_ratio, first.penalty, 0.0
+    ratio, rivals, penalty = fit.camera_noise_ratio, 0.0, first.penalty
     least_noise, sufficient = settings.limits.least_noise, False
-    widths: Widths | None = None
     if whole:
-        few = bool(table.parts) or not every_point or table.outliers is not None
-        n_max = n_directions(first, paper_shapes.shape[2], few)
         fit = steadiest(first, table, fit)
-        widths, rivals = fit.widths, fit.rivals
-        assert widths is not None
+        rivals = fit.rivals
         # More directions, if the table supports all of the first ones
-        if len(widths.variances) == FEW_DIRECTIONS < n_max:
-            fit, widths = whole_distribution(first, extended(first, fit, n_max))
-        # Directions that explain the table up to rounding leave no noise.
-        # Points that were filled in have errors: room for three directions more
-        # (docs/benchmarks/README.md, "Thresholds").
-        n_known = len(widths.variances) + (0 if every_point else 3)
-        exact = explained(first, table, fit, widths.n_relevant, n_known)
-        if exact is not None:
-            fit, least_noise = exact, NOISE_FLOOR
-            widths = widths.of_points(paper_shapes.shape[2], widths.n_relevant)
-        else:
-            least_noise = LEAST_NOISE
-            problem = replace(first, widths=widths)
-            fit = problem.refined(fit.state, least_noise=least_noise, tol=settings.tol)
+        few = bool(table.parts) or not every_point or table.outliers is not None
+        n_max = few_directions(few)
+        if len(fit.state.shapes) - 1 == FEW_DIRECTIONS < n_max:
+            fit = whole_distribution(first, extended(first, fit.state, n_max).state)
+        fit, least_noise = explained(first, table, fit, every_point)
     elif fit.prior is None:
         assert start is not None
         fit, least_noise, sufficient = judged(first, table, fit, start)
@@ -165,9 +153,8 @@ def fit_jointly(
 
     def of_all(larger: JointProblem) -> JointProblem:
         """Return a problem with the priors of the fit of the sample."""
-        if widths is not None:
-            return replace(larger, widths=widths)
-        return replace(larger.with_prior(fit.prior), penalty=penalty)
+        larger = larger.with_prior(fit.prior)
+        return replace(larger, penalty=penalty, widths=fit.widths)
 
     problem = of_all(first)
     if sufficient and not table.parts:  # a smaller tolerance is safe
@@ -182,30 +169,37 @@ def fit_jointly(
         if table.outliers is None:
             state = problem.aligned(fit.state, starts)
             fit = problem.refined(state, least_noise=least_noise)
-    noise, n_pose = fit.state.noise, 2 + first.cameras.n_parameters
-    if table.outliers is not None:
-        # This noise variance is corrected for the unknowns of the frames already.
-        problem, fit, noise = reweighted(problem, table, fit, least_noise)
-        n_pose = 0
-    elif table.compressed and not every_point:
+    n_pose = 2 + first.cameras.n_parameters
+    if table.compressed and table.outliers is None and not every_point:
         # After completed frames, the points that are seen, and weights
         shapes = problem.frames.points(fit.state.shapes)
         problem = replace(problem, frames=_visible_frames(table))
         state = fit.state._replace(shapes=shapes)
         fit = problem.refined(state, least_noise=least_noise)
-        noise = fit.state.noise
+    noise = fit.state.noise
+    if table.outliers is not None:
+        # This noise variance is corrected for the unknowns of the frames already.
+        problem, fit, noise = reweighted(problem, table, fit, least_noise)
+        n_pose = 0
     shapes = problem.frames.points(fit.state.shapes)
     # Coefficients of the sample, and degrees of freedom of the noise
-    state = fit.state._replace(shapes=first.frames.coordinates(shapes))
-    if table.parts:
-        state = state._replace(motion=state.motion[table.parts[0]])
-    if widths is None:
-        n_seen, prior = table.scaled.n_seen, fit.prior
-        noise *= _freedom_correction(n_seen, shapes.shape, n_pose, prior)
+    state = _of_sample(first, table, fit.state._replace(shapes=shapes))
+    if fit.widths is None:
+        n_seen = table.scaled.n_seen
+        noise *= _freedom_correction(n_seen, shapes.shape, n_pose, fit.prior)
     end = JointState(centred(shapes), fit.state.motion, max(noise, OF_DISTANCES**2))
-    fit = fit._replace(state=end, camera_noise_ratio=ratio, widths=widths)
-    fit = fit._replace(rivals=rivals)
+    fit = fit._replace(state=end, camera_noise_ratio=ratio, rivals=rivals)
     return fit, problem.frames, first.likelihood(*state).alpha
+
+
+def _of_sample(
+    problem: JointProblem, table: FactorisedTable, state: JointState
+) -> JointState:
+    """Return a state of all frames as one of the first sample, by its coordinates."""
+    shapes, motion, noise = state
+    if table.parts and len(motion):
+        motion = motion[table.parts[0]]
+    return JointState(problem.frames.coordinates(shapes), motion, noise)
 
 
 def _likeliest_fit(
@@ -216,12 +210,11 @@ def _likeliest_fit(
     n_max = min(len(paper_shapes) - 1, n)
     n_first, *more = dict.fromkeys(min(k, n_max) for k in FIRST_COMPONENTS)
     more = more if problem.settings.limits.restarts else []
-    rough, cameras = {"tol": problem.settings.tol}, problem.cameras
-    fits = [_first_fit(problem, table, paper_shapes[: n_first + 1], **rough)[0]]
+    tol = problem.settings.tol
+    fits = [_first_fit(problem, table, paper_shapes[: n_first + 1], tol=tol)[0]]
     for k in more:
-        paper = paper_shapes[: k + 1]
-        fits.append(_calibrated_fit(problem, table, paper, cameras, **rough)[0])
-    ends = [extended(problem, fit, n) for fit in fits]
+        fits.append(_calibrated_fit(problem, table, paper_shapes[: k + 1], tol=tol)[0])
+    ends = [extended(problem, fit.state, n) for fit in fits]
     best = min(ends, key=lambda fit: (evidence(problem, fit), _end(fit)))
     # The noise variances of both camera models, each for its degrees of freedom, of few
     # basis shapes: more of them explain what wrong cameras leave.
@@ -232,7 +225,7 @@ def _likeliest_fit(
     )
     ratio = max(fits[0].camera_noise_ratio * correction / affine_correction, 1.0)
     # With as many steps again, as only the best one is refined further
-    return extended(problem, best, n)._replace(camera_noise_ratio=ratio)
+    return extended(problem, best.state, n)._replace(camera_noise_ratio=ratio)
 
 
 def other_fits(
@@ -248,16 +241,13 @@ def other_fits(
         return states
     problem = next(_problems(table, paper, settings))
     n = n_directions(problem, paper.shape[2], few=True)
-    state = joint.state
-    state = state._replace(shapes=problem.frames.coordinates(state.shapes[: n + 1]))
-    if table.parts:
-        state = state._replace(motion=state.motion[table.parts[0]])
-    best = evidence(problem, extended(problem, joint._replace(state=state), n))
-    n_max, limits = min(len(paper) - 1, n), {"tol": settings.tol}
+    state = joint.state._replace(shapes=joint.state.shapes[: n + 1])
+    state = _of_sample(problem, table, state)
+    best = evidence(problem, extended(problem, state, n))
+    n_max = min(len(paper) - 1, n)
     for k in dict.fromkeys(min(k, n_max) for k in OTHER_COMPONENTS):
-        part, cameras = paper[: k + 1], problem.cameras
-        fit, _ = _calibrated_fit(problem, table, part, cameras, **limits)
-        fit = extended(problem, fit, n)
+        fit, _ = _calibrated_fit(problem, table, paper[: k + 1], tol=settings.tol)
+        fit = extended(problem, fit.state, n)
         weight = float(np.exp(min(best - evidence(problem, fit), 0.0) / 2.0))
         if weight > LEAST_WEIGHT:
             shapes = centred(problem.frames.points(fit.state.shapes))
@@ -280,8 +270,7 @@ def steadiest(
     n = min(len(first.state.shapes) - 1, FEW_DIRECTIONS)
     n_first = min(FIRST_COMPONENTS[0], n)
     before = evidence(problem, first)
-    fit, widths = whole_distribution(problem, first)
-    fit = fit._replace(widths=widths)
+    fit = whole_distribution(problem, first.state)
     restarts = problem.settings.limits.restarts
     if not restarts or not np.isfinite(before):  # nothing turns
         return fit
@@ -290,47 +279,46 @@ def steadiest(
 
     def expanded(state: JointState) -> JointFit:
         """Return the fit of n directions from a state, first with its own."""
-        other, k = fit._replace(state=state), len(state.shapes) - 1
+        k = len(state.shapes) - 1
         if k < n:
-            other = extended(problem, other, k, max_iter=200, tol=0.2)
-        return extended(problem, other, n)
+            state = extended(problem, state, k, max_iter=200, tol=0.2).state
+        return extended(problem, state, n)
 
-    def lifted(motion: NDArray, k: int) -> JointFit:
-        """Return the fit of n directions from cameras, first with k of them."""
+    def lifted(motion: NDArray, k: int) -> JointState:
+        """Return a state of k directions that fit cameras."""
         shapes = lifted_shapes(rows, motion, k)
-        return expanded(held_fit(problem, rows, motion, shapes).state)
+        return held_fit(problem, rows, motion, shapes).state
 
     def compare(other: JointFit, margin: float) -> None:
         """Add a fit, if it may be the most evident one."""
         at_first = evidence(problem, other)
         if at_first < before + margin:
-            other, widths = whole_distribution(problem, other)
-            other = other._replace(widths=widths)
+            other = whole_distribution(problem, other.state)
             found.append((evidence(problem, other), at_first, other))
 
     for _ in range(4):
         motion, tried = steadied(latest.state.motion), len(found)
         for k in {n_first, n}:
-            compare(lifted(motion, k), HOPELESS)
+            compare(expanded(lifted(motion, k)), HOPELESS)
         if len(found) == tried:
             break
         latest = min(found[tried:], key=itemgetter(0))[2]
 
     best = min(found, key=itemgetter(0))[2]
     if both_sides(best.state):
-        compare(lifted(flat_cameras(problem, best.state), n_first), HOPELESS)
+        motion = flat_cameras(problem, best.state)
+        compare(expanded(lifted(motion, n_first)), HOPELESS)
         # Few directions lead out of minima where others explain wrong cameras.
         for k in AGAIN:
             _, before, best = min(found, key=itemgetter(0))
-            compare(lifted(best.state.motion, min(k, n)), 0.0)
+            compare(expanded(lifted(best.state.motion, min(k, n))), 0.0)
 
     for n_groups in GROUPS:
         _, before, best = min(found, key=itemgetter(0))
         alpha = replace(problem, widths=best.widths).likelihood(*best.state).alpha
         motion = reversed_groups(problem, rows, best.state.motion, alpha, n_groups)
         if np.any(motion != best.state.motion):
-            other = problem.turned_back(lifted(motion, n), problem.cameras, expanded)
-            compare(other, -least_gain)
+            compare(problem.turned_back(lifted(motion, n), expanded), -least_gain)
     found.sort(key=itemgetter(0))
     best, n_found = found[0][2], len(found)
     rivals = rival_depths(problem, [(value, fit) for value, _, fit in found])
@@ -352,7 +340,9 @@ def count_components(
     """
     problem = next(_problems(table, paper_shapes, settings))
     fit, _ = _first_fit(problem, table, paper_shapes)
-    return whole_distribution(problem, fit)[1].n_relevant
+    widths = whole_distribution(problem, fit.state).widths
+    assert widths is not None
+    return widths.n_relevant
 
 
 def _problems(
@@ -383,40 +373,35 @@ def _first_fit(
     problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray, **limits: Any
 ) -> tuple[JointFit, JointState]:
     """Return the fit of the sample, with its noise ratio, and one of its starts."""
-    cameras, affine = problem.cameras, CAMERAS["affine"]
-    calibrated = cameras if cameras.calibrated else CAMERAS["weak_perspective"]
-    fit, start = _calibrated_fit(problem, table, paper_shapes, calibrated, **limits)
+    settings, calibrated = problem.settings, problem.cameras.calibrated
+    affine = replace(problem, seen_by=CAMERAS["affine"])
+    weak = replace(problem, seen_by=CAMERAS["weak_perspective"])
+    first = problem if calibrated else weak
+    fit, start = _calibrated_fit(first, table, paper_shapes, **limits)
     # Affine cameras, from the calibrated fit and from the paper's result
     rigid = affine_start(problem, table.W, paper_shapes)
     # Some steps without the prior: with the large noise of a start it would make basis
     # shapes vanish.
-    free, tol = replace(problem, penalty=0.0), problem.settings.tol
-    state = free.refined(rigid, affine, max_iter=FIXED_STEPS, tol=tol).state
+    free = replace(affine, penalty=0.0)
+    state = free.refined(rigid, max_iter=FIXED_STEPS, tol=settings.tol).state
     states = [fit.state, with_prior(problem, state)]
-    refined = partial(problem.refined, cameras=affine)
-    max_iter = problem.settings.max_iter
-    if cameras.calibrated:  # only compared
-        max_iter = min(max_iter, 60)
+    # With calibrated cameras, affine ones are only compared.
+    max_iter = min(settings.max_iter, 60) if calibrated else settings.max_iter
     if not problem.thorough:  # only the better one continues
-        raced = map(partial(refined, max_iter=min(max_iter, 5)), states)
+        raced = (affine.refined(state, max_iter=min(max_iter, 5)) for state in states)
         states = [min(raced, key=_end).state]
-    other = min(map(partial(refined, max_iter=max_iter), states), key=_end)
+    other = min((affine.refined(s, max_iter=max_iter) for s in states), key=_end)
     ratio = fit.misfit / min(other.misfit, fit.misfit)
-    if cameras.calibrated:
-        return fit._replace(camera_noise_ratio=ratio), start
-    return other._replace(camera_noise_ratio=ratio), rigid
+    fit, start = (fit, start) if calibrated else (other, rigid)
+    return fit._replace(camera_noise_ratio=ratio), start
 
 
 def _calibrated_fit(
-    problem: JointProblem,
-    table: FactorisedTable,
-    paper_shapes: NDArray,
-    cameras: CameraModel,
-    **limits: Any,
+    problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray, **limits: Any
 ) -> tuple[JointFit, JointState]:
     """Return the fit of calibrated cameras from the best starts, and the best start."""
-    starts = best_starts(problem, table, paper_shapes, cameras)
-    refined = partial(problem.unreversed, cameras=cameras, **limits)
+    starts = best_starts(problem, table, paper_shapes)
+    refined = partial(problem.unreversed, **limits)
     return min(map(refined, starts), key=_end), starts[0]
 
 
@@ -453,22 +438,30 @@ def judged(
 
 
 def explained(
-    problem: JointProblem, table: FactorisedTable, fit: JointFit, K: int, n_known: int
-) -> JointFit | None:
-    """Return the fit of K directions without floor, if these leave no more than noise.
+    problem: JointProblem, table: FactorisedTable, fit: JointFit, every_point: bool
+) -> tuple[JointFit, float]:
+    """Return the fit of all directions with their widths, and its noise floor.
 
-    None if not: parts that turn may have images of low rank, but are no sums of few
-    shapes. K directions have to leave the noise of the spectrum.
+    If the relevant directions leave no more than the noise of the spectrum, the fit is
+    that of these, without floor. It may leave more: parts that turn may have images of
+    low rank, but are no sums of few shapes. Points that were filled in have errors:
+    they need room for three directions more (docs/benchmarks/README.md, "Thresholds").
     """
-    if not table.explained_by(n_known, LEAST_NOISE):
-        return None
-    state = fit.state._replace(shapes=fit.state.shapes[: K + 1])
-    state = unregularised(problem, state).state
-    level = problem.settings.limits.right * table.noise_level(K)
-    if state.noise > max(level, RELEASED * LEAST_NOISE) * problem.mean_square:
-        return None
-    free, tol = replace(problem, penalty=0.0), problem.settings.tol
-    return free.refined(state, least_noise=NOISE_FLOOR, tol=tol)
+    widths, tol = fit.widths, problem.settings.tol
+    assert widths is not None
+    n_known = len(widths.variances) + (0 if every_point else 3)
+    if table.explained_by(n_known, LEAST_NOISE):
+        n = widths.n_relevant
+        state = fit.state._replace(shapes=fit.state.shapes[: n + 1])
+        state = unregularised(problem, state).state
+        level = problem.settings.limits.right * table.noise_level(n)
+        if state.noise <= max(level, RELEASED * LEAST_NOISE) * problem.mean_square:
+            free = replace(problem, penalty=0.0)
+            fit = free.refined(state, least_noise=NOISE_FLOOR, tol=tol)
+            widths = widths.of_points(widths.n_numbers // 3, n)
+            return fit._replace(widths=widths), NOISE_FLOOR
+    problem = replace(problem, widths=widths)
+    return problem.refined(fit.state, least_noise=LEAST_NOISE, tol=tol), LEAST_NOISE
 
 
 def unregularised(problem: JointProblem, state: JointState) -> JointFit:
@@ -484,7 +477,7 @@ def unregularised(problem: JointProblem, state: JointState) -> JointFit:
         if state.noise > 0.95 * before:
             break
         if problem.cameras.calibrated:
-            state, _ = problem.reversed_back(state, problem.cameras)
+            state, _ = problem.reversed_back(state)
     return fit
 
 
@@ -514,7 +507,7 @@ def widened(problem: JointProblem, fit: JointFit) -> JointFit:
         shapes, _, noise = fit.state
         curvature = problem.likelihood(*fit.state).shape_curvature
         before, prior = fit.prior.width, fit.prior.updated(shapes, curvature, noise)
-        fit = problem.with_prior(prior).unreversed(fit.state, problem.cameras)
+        fit = problem.with_prior(prior).unreversed(fit.state)
         if abs(prior.width - before) < SETTLED_WIDTH * prior.width:
             break
     return fit
@@ -529,7 +522,7 @@ def deepened(problem: JointProblem, fit: JointFit) -> JointFit:
     assert prior is not None
     found = [(_end(fit) / n + 0.5 * prior.cost, fit)]
     for start, other, _ in other_depths(fit.state, problem.cameras, prior):
-        trial = problem.with_prior(other).unreversed(start, problem.cameras)
+        trial = problem.with_prior(other).unreversed(start)
         found.append((_end(trial) / n + 0.5 * other.cost, trial))
     best = min(found, key=itemgetter(0))[1]
     return fit if best is fit else deepened(problem, widened(problem, best))
@@ -577,7 +570,7 @@ def reweighted(
     for _ in range(20):
         shapes, motion, _ = fit.state
         alpha = problem.likelihood(*fit.state).alpha
-        distance = _distances((points, weights), shapes, motion, alpha)
+        distance = lengths(centred_residuals(points, weights, shapes, motion, alpha))
         # Enough frames for the median of the residuals
         subset = slice(None, None, max(distance.size // 150_000, 1))
         state = fit.state._replace(motion=motion[subset])
@@ -673,21 +666,12 @@ def left_out_distances(model: FrameModel, rows: NDArray) -> NDArray:
     return np.where((w > 0) & enough, distance, np.nan)
 
 
-def _distances(
-    block: WeightedRows, shapes: NDArray, motion: NDArray, alpha: NDArray
-) -> NDArray:
-    """Return distances (n, J) of frames from a model whose weighted mean is theirs."""
-    rows, weights = block
-    residual = residuals(rows, shapes, motion, alpha)
-    total = weights.sum(axis=1)[:, None]  # zero where no point counts
-    position = np.einsum("ij,icj->ic", weights, np.nan_to_num(residual))
-    residual -= (position / np.where(total > 0, total, 1.0))[..., None]
-    return lengths(residual)
-
-
 def _weighted(
     block: WeightedRows, *fit: NDArray, shapes: NDArray, loss: str, deviation: float
 ) -> WeightedRows:
     """Return frames with the weights of their residuals from a fit."""
-    sizes, distance = robust_sizes(block[0]), _distances(block, shapes, *fit)
+    distance, sizes = (
+        lengths(centred_residuals(*block, shapes, *fit)),
+        robust_sizes(block[0]),
+    )
     return block[0], frame_weights(loss, distance, deviation, sizes)

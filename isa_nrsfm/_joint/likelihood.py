@@ -133,6 +133,13 @@ class JointFrames:
         return cls(rows.derive(lambda rows: frame_tracks(*without(rows))))
 
     @classmethod
+    def of_rows(cls, rows: NDArray, observations: NDArray | None = None) -> Self:
+        """Return rows (n, 2, J) by points, with observations (n, J), as one block."""
+        complete = bool(np.isfinite(rows).all())
+        block = FrameBlocks.of_blocks([rows], [len(rows)])
+        return cls.from_points(block, complete, observations)
+
+    @classmethod
     def from_weighted(cls, weighted: FrameBlocks) -> Self:
         """Return frames by points, from blocks of `WeightedRows`."""
         return cls(weighted.derive(lambda block: frame_tracks(*block)))
@@ -228,10 +235,11 @@ class MarginalLikelihood(NamedTuple):
 
         def over_block(block: FrameTracks, motion: NDArray) -> Terms:
             """Return the sums over pieces whose matrices fit the cache."""
-            M, parts = linalg.frames_last(motion), []
-            for frames, piece in block.pieces(len(shapes)):
-                parts.append(self._terms(piece, M[:, :, frames], products, noise))
-            return _joined(parts)
+            M, pieces = linalg.frames_last(motion), block.pieces(len(shapes))
+            return _joined(
+                self._terms(piece, M[:, :, frames], products, noise)
+                for frames, piece in pieces
+            )
 
         sums, by_frame = _joined(self.frames.blocks.map(over_block, motion))
         value, noise_gradient, shape_gradient, packed, residual = sums
@@ -315,13 +323,11 @@ class MarginalLikelihood(NamedTuple):
 
 def _joined(parts: Iterable[Terms]) -> Terms:
     """Add the sums of consecutive frames, and concatenate the terms of each frame."""
-    sums: Any = ()
+    sums: Any = None
     by_frame: list[Any] = []
     for added, terms in parts:
-        sums = tuple(map(add, sums, added)) if by_frame else added
+        sums = added if sums is None else tuple(map(add, sums, added))
         by_frame.append(terms)
-    if len(by_frame) == 1:
-        return sums, terms
     join = partial(np.concatenate, axis=-1)
     return sums, tuple(map(join, zip(*by_frame, strict=True)))
 

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -186,6 +187,7 @@ class JointProblem:
     thorough: whether many starts are compared, as for small tables.
     penalty: factor of the prior of the basis shapes.
     widths: prior variances of all directions of a shape, in place of the penalty.
+    seen_by: camera model, if it is not that of the settings.
     """
 
     frames: JointFrames
@@ -193,11 +195,12 @@ class JointProblem:
     thorough: bool = False
     penalty: float = 0.0
     widths: Widths | None = None
+    seen_by: CameraModel | None = None
 
     def part(self, chosen: NDArray, tol: float) -> "JointProblem":
         """Return the problem of a sample of the frames, with another tolerance."""
         frames, settings = self.frames.take(chosen), self.settings._replace(tol=tol)
-        return JointProblem(frames, settings, False, self.penalty)
+        return replace(self, frames=frames, settings=settings, thorough=False)
 
     def with_prior(self, prior: ShapePrior | None) -> "JointProblem":
         """Return the problem with another prior of the shapes."""
@@ -205,8 +208,8 @@ class JointProblem:
 
     @property
     def cameras(self) -> CameraModel:
-        """The camera model of the settings."""
-        return CAMERAS[self.settings.camera]
+        """The camera model."""
+        return self.seen_by or CAMERAS[self.settings.camera]
 
     @property
     def mean_square(self) -> float:
@@ -216,11 +219,17 @@ class JointProblem:
 
     @cached_property
     def likelihood(self) -> MarginalLikelihood:
-        """The objective."""
+        """The objective without the prior of the extents."""
         if self.widths is not None:
             return self.widths.likelihood(self.frames, self.cameras.name)
         prior = self.settings.shape_prior
         return MarginalLikelihood(self.frames, self.penalty, prior=prior)
+
+    @property
+    def objective(self) -> MarginalLikelihood:
+        """The objective with the prior of the extents, if it is needed."""
+        free = self.cameras.name == "affine" or self.settings.shape_prior is not None
+        return self.likelihood._replace(extent_weight=0.0 if free else EXTENT_WEIGHT)
 
     def aligned(self, state: JointState, starts: NDArray | None = None) -> JointState:
         """Return a state with the best cameras of these frames for its centred shapes.
@@ -234,61 +243,43 @@ class JointProblem:
         motion = self.frames.blocks.joined(lambda block: fit(block).motion)
         return JointState(shapes, motion, noise)
 
-    def refined(
-        self, state: JointState, cameras: CameraModel | None = None, **limits: Any
-    ) -> JointFit:
+    def refined(self, state: JointState, **limits: Any) -> JointFit:
         """Refine a state jointly, within the limits of the settings or other ones."""
-        cameras, settings = cameras or self.cameras, self.settings
+        settings = self.settings
         options = {
             "least_noise": settings.limits.least_noise,
             "max_iter": settings.max_iter,
             "tol": settings.tol * (0.1 if self.thorough else 1.0),
             "on_step": settings.on_step,
         }
-        return refine_joint(self.objective(cameras), state, cameras, **options | limits)
+        fit = refine_joint(self.objective, state, self.cameras, **options | limits)
+        return fit._replace(widths=self.widths)
 
-    def objective(self, cameras: CameraModel) -> MarginalLikelihood:
-        """Return the objective with the prior of the extents, if it is needed."""
-        free = cameras.name == "affine" or self.settings.shape_prior is not None
-        return self.likelihood._replace(extent_weight=0.0 if free else EXTENT_WEIGHT)
-
-    def unreversed(
-        self, state: JointState, cameras: CameraModel, **limits: Any
-    ) -> JointFit:
+    def unreversed(self, state: JointState, **limits: Any) -> JointFit:
         """Refine a state; with calibrated cameras no frame stays reversed in depth."""
-
-        def refined(state: JointState) -> JointFit:
-            return self.refined(state, cameras, **limits)
-
-        fit = refined(state)
-        if self.thorough and cameras.calibrated:
-            fit = self.turned_back(fit, cameras, refined)
-        return fit
+        refined = partial(self.refined, **limits)
+        calibrated = self.thorough and self.cameras.calibrated
+        return self.turned_back(state, refined) if calibrated else refined(state)
 
     def turned_back(
-        self,
-        fit: JointFit,
-        cameras: CameraModel,
-        refined: Callable[[JointState], JointFit],
+        self, state: JointState, refined: Callable[[JointState], JointFit]
     ) -> JointFit:
         """Return the fit that is refined until no frame is reversed in depth."""
+        fit = refined(state)
         for _ in range(5):
-            state, n_reversed = self.reversed_back(fit.state, cameras)
+            state, n_reversed = self.reversed_back(fit.state)
             if not n_reversed:
                 break
             fit = refined(state)
         return fit
 
-    def reversed_back(
-        self, state: JointState, cameras: CameraModel
-    ) -> tuple[JointState, int]:
+    def reversed_back(self, state: JointState) -> tuple[JointState, int]:
         """Return a state without frames that are reversed in depth, and their number.
 
         The search for each frame is repeated from its camera reversed in depth. The
         result is used if its objective is lower.
         """
-        search = FrameSearch(state.shapes, cameras)
-        motion, better = self._searched(search.reversed_cameras, search, state)
+        motion, better = self._searched(FrameSearch.reversed_cameras, state)
         return state._replace(motion=motion), int(better.sum())
 
     def reversal_error(self, state: JointState, depths: NDArray) -> float:
@@ -297,27 +288,25 @@ class JointProblem:
         Relative to their mean square. Each frame is reversed with the probability ``1 /
         (1 + exp(r / 2))``, r the rise of -2 log L at the minimum from there.
         """
-        search = FrameSearch(state.shapes, self.cameras)
-        motion, alpha, rise = self._searched(search.reversals, search, state)
+        motion, alpha, rise = self._searched(FrameSearch.reversals, state)
         other = state._replace(motion=motion).depths(alpha)
         square = np.sum((other - depths) ** 2, axis=1)
         return float(expit(-rise / 2) @ square / max(np.sum(depths**2), 1e-300))
 
-    def _searched(
-        self, method: Any, search: FrameSearch, state: JointState
-    ) -> tuple[NDArray, ...]:
-        """Return the results of a method of a search for all frames."""
+    def _searched(self, method: Any, state: JointState) -> list[NDArray]:
+        """Return the results of a method of the search for all frames."""
+        search = FrameSearch(state.shapes, self.cameras)
 
-        def of_block(block: FrameTracks, motion: NDArray) -> Any:
+        def of_block(block: FrameTracks, motion: NDArray) -> list[Any]:
             parts = []
             for frames, piece in block.pieces(len(state.shapes)):
                 sums = frame_sums(piece, search.shared)
                 problem = search.problem(sums, np.full(len(sums.weight), state.noise))
-                parts.append(method(problem, motion[frames]))
-            return tuple(map(np.concatenate, zip(*parts, strict=True)))
+                parts.append(method(search, problem, motion[frames]))
+            return parts
 
-        parts = self.frames.blocks.map(of_block, state.motion)
-        return tuple(map(np.concatenate, zip(*parts, strict=True)))
+        parts = chain.from_iterable(self.frames.blocks.map(of_block, state.motion))
+        return list(map(np.concatenate, zip(*parts, strict=True)))
 
 
 def refine_joint(
@@ -432,7 +421,8 @@ class _Iterate:
             stacked = (by_shapes @ stacked.T[:, :, None])[:, :, 0].T
         if self.prior is not None:
             stacked = self.prior.projected(stacked.reshape(shapes.shape))
-        steps = self.cameras.product(by_cameras, steps)
+        rows = steps.reshape(len(steps) // len(by_cameras), *by_cameras.shape[1:])
+        steps = np.einsum("abn,rbn->ran", by_cameras, rows)
         return _stacked(half * stacked, half * steps, noise / self.n_seen)
 
     def split(self, vector: NDArray) -> tuple[NDArray, NDArray, float]:

@@ -144,7 +144,7 @@ def reversed_groups(
         part = problem.part(other_frames, problem.settings.tol)
         shapes = lifted_shapes(rows[other_frames], motion[other_frames], alpha.shape[1])
         state = held_fit(part, rows[other_frames], motion[other_frames], shapes).state
-        state, _ = problem.reversed_back(state._replace(motion=motion), problem.cameras)
+        state, _ = problem.reversed_back(state._replace(motion=motion))
         motion = np.where(members[:, None, None], state.motion, motion)
     return motion
 
@@ -227,11 +227,11 @@ def affine_start(problem: JointProblem, W: NDArray, paper: NDArray) -> JointStat
 
 
 def best_starts(
-    problem: JointProblem, table: FactorisedTable, paper: NDArray, cameras: CameraModel
+    problem: JointProblem, table: FactorisedTable, paper: NDArray
 ) -> list[JointState]:
     """Return the likeliest starts, best first: three of small tables, one of others."""
     frames, limits = problem.frames, problem.settings.limits
-    factors, thorough = table.factors, problem.thorough
+    factors, thorough, scaled = table.factors, problem.thorough, problem.cameras.scaled
     # Frames for the comparison, spread evenly from the most to the least rigid
     rows = frames.coordinates(table.W).reshape(frames.n_frames, 2, -1)
     order = np.argsort(rigid_energy(rows, frames.coordinates(factors.rigid_shape)))
@@ -249,7 +249,7 @@ def best_starts(
         trials.append((fit.history[-1], fit.state, motion))
 
     # Rigid cameras, with the paper's and with lifted basis shapes
-    motion, shapes = rigid_start(factors, frames.coordinates(paper), cameras.scaled)
+    motion, shapes = rigid_start(factors, frames.coordinates(paper), scaled)
     compare(motion, _scaled(seen, motion[sample], shapes))
     compare(motion)
     # Mixtures of more and more columns, until the objective rises. Small tables use all
@@ -257,7 +257,7 @@ def best_starts(
     # one.
     scales = np.linalg.norm(motion, axis=(1, 2)) / np.sqrt(2)
     families = [scales, None] if thorough else [scales]
-    for divisors in families if cameras.scaled else [None]:
+    for divisors in families if scaled else [None]:
         before = np.inf
         for mixed in mixed_cameras(rows, divisors, sample, limits.widths):
             compare(mixed)
@@ -268,7 +268,7 @@ def best_starts(
     trials.sort(key=itemgetter(0))
     freed = []
     for _, state, motion in trials if thorough else trials[:1]:
-        fit = part.refined(state, cameras, max_iter=30)
+        fit = part.refined(state, max_iter=30)
         motion = motion.copy()
         motion[sample] = fit.state.motion
         freed.append((fit.history[-1], fit.state._replace(motion=motion)))
@@ -284,8 +284,8 @@ def held_fit(
     With the large noise of a start, the prior would make basis shapes vanish.
     """
     state = first_state(problem, rows, motion, shapes)
-    free = replace(problem, penalty=0.0)
-    return free.refined(state, AffineCameras(held=True), max_iter=FIXED_STEPS)
+    held = replace(problem, penalty=0.0, seen_by=AffineCameras(held=True))
+    return held.refined(state, max_iter=FIXED_STEPS)
 
 
 def first_state(

@@ -36,9 +36,9 @@ from scipy.special import softmax
 
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
+    centred_residuals,
     distances,
     full_rotations,
-    residuals,
     stacked_motion,
 )
 from isa_nrsfm._frames.models import (
@@ -55,7 +55,7 @@ from isa_nrsfm._joint.problem import JointFit, JointProblem, JointState, refine_
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import camera_moments, other_depths, steadied, stretched
 from isa_nrsfm._joint.whole import FAR_FRAMES
-from isa_nrsfm._linalg import OF_DISTANCES, centred
+from isa_nrsfm._linalg import OF_DISTANCES, centred, lengths
 from isa_nrsfm._prepare.robust import frame_weights, robust_sizes
 from isa_nrsfm._prepare.scaling import ScaledTable
 from isa_nrsfm._tables import (
@@ -266,33 +266,24 @@ def depth_certainty(
     frames: FrameModel, table: ScaledTable, joint: JointFit, settings: FitSettings
 ) -> DepthCertainty:
     """Estimate the errors of the model of a joint fit from some frames, if enough."""
-    limits, widths = settings.limits, joint.widths
+    limits, widths, prior = settings.limits, joint.widths, settings.shape_prior
     part, fit, w = inlying_rows(frames, table.rows, MOST_FRAMES, table.weights)
     n_points = frames.shapes.shape[2]
     points = np.linspace(0, n_points - 1, min(n_points, MOST_POINTS)).astype(int)
-    # Directions are sorted by their size, and as many as these frames determine.
-    n_max = MOST_DIRECTIONS if settings.shape_prior is None else len(frames.shapes)
     part, mean_shape = part[:, :, points], frames.shapes[0][:, points]
-    groups = neighbours(mean_shape)
+    groups, seen = neighbours(mean_shape), seen_points(part)
     parts = [groups != group for group in range(N_GROUPS)]
-    seen = np.asarray(np.isfinite(part).all(axis=1))
     n_seen = np.min([seen[:, kept].sum(axis=1) for kept in parts], axis=0)
     mask = n_seen >= FEWEST_POINTS
     if mask.sum() < 2:
         return NOT_ESTIMATED
     w = None if w is None else w[np.ix_(mask, points)]
+    # Directions are sorted by their size, and as many as these frames determine.
+    n_max = MOST_DIRECTIONS if prior is None else len(frames.shapes)
     shapes, motion = frames.shapes[: n_max + 1, :, points], fit.motion[mask]
     tracks, camera = part[mask], CAMERAS[frames.camera]
-    prior, extents = settings.shape_prior, EXTENT_WEIGHT
-    if prior is not None:  # which does not let depths grow
-        prior, extents = prior.of_points(points), 0.0
-
-    def of_points(kept: NDArray) -> JointFrames:
-        """Return the frames of the kept points."""
-        rows = tracks[:, :, kept]
-        blocks = FrameBlocks.of_array(rows, len(rows))
-        counts = None if w is None else w[:, kept]
-        return JointFrames.from_points(blocks, bool(np.isfinite(rows).all()), counts)
+    prior = None if prior is None else prior.of_points(points)
+    extents = EXTENT_WEIGHT if prior is None else 0.0  # a prior limits depths
 
     def refit(
         kept: NDArray,
@@ -307,7 +298,8 @@ def depth_certainty(
         objective for each frame, without the prior of the extents. of_images: factors
         of a prior of the images of the directions, in place of that of their points.
         """
-        part = of_points(kept)
+        counts = None if w is None else w[:, kept]
+        part = JointFrames.of_rows(tracks[:, :, kept], counts)
         n_numbers, energy = part.totals
         noise = max(frames.noise_variance, LEAST_NOISE * energy / n_numbers)
         if start is None:
@@ -320,8 +312,7 @@ def depth_certainty(
             if of_images is not None:
                 likelihood = likelihood._replace(precisions=None, penalty=of_images)
         else:
-            penalty = part.basis_penalty(limits.basis_std)
-            likelihood = MarginalLikelihood(part, penalty)
+            likelihood = MarginalLikelihood(part, part.basis_penalty(limits.basis_std))
         likelihood = likelihood._replace(extent_weight=extents)
         floor = min(noise * n_numbers / energy, limits.least_noise)
         start = start._replace(noise=noise)
@@ -333,7 +324,7 @@ def depth_certainty(
 
     every = np.ones(len(points), dtype=bool)
     whole, rotations, depths, value = refit(every, extents=extents)
-    problem = JointProblem(of_points(every), settings)
+    problem = JointProblem(JointFrames.of_rows(tracks, w), settings)
     deformation = joint.rivals + problem.reversal_error(whole, depths)
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
@@ -471,14 +462,11 @@ def half_tables(
         """Return ``sum_i X_i^T r_i`` over the frames of each part."""
         seen = seen_points(rows)
         w = weights[0] if weights else seen.astype(float)
-        residual = residuals(rows, shapes, motion, alpha)
-        residual[~np.broadcast_to(seen[:, None], residual.shape)] = 0.0
-        mean = np.einsum("irj,ij->ir", residual, w) / w.sum(axis=1)[:, None]
+        residual = centred_residuals(rows, w, shapes, motion, alpha)
         if model.loss != "linear":
-            distance = distances(rows, shapes, motion, mean, alpha)
             deviation, sizes = np.sqrt(model.noise_variance), robust_sizes(rows)
-            w = seen * frame_weights(model.loss, distance, deviation, sizes)
-        residual = (residual - mean[:, :, None]) * w[:, None]
+            w = seen * frame_weights(model.loss, lengths(residual), deviation, sizes)
+        residual = np.nan_to_num(residual) * w[:, None]
         X = stacked_motion(motion, alpha).reshape(*residual.shape[:2], -1)
         chosen = [part == number for number in range(len(SIGNS))]
         parts = ((X[frames], residual[frames]) for frames in chosen)

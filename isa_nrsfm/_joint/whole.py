@@ -27,14 +27,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from isa_nrsfm._frames.camera_models import CalibratedCameras, full_rotations
-from isa_nrsfm._joint.problem import (
-    JointFit,
-    JointProblem,
-    JointState,
-    Widths,
-    regular,
-)
+from isa_nrsfm._frames.camera_models import full_rotations
+from isa_nrsfm._joint.problem import JointFit, JointProblem, JointState, Widths, regular
 from isa_nrsfm._joint.starts import camera_moments
 from isa_nrsfm._linalg import OF_DISTANCES, frames_first, frames_last, unpacked
 
@@ -66,13 +60,16 @@ def n_directions(problem: JointProblem, n_points: int, few: bool) -> int:
 
 
 def extended(
-    problem: JointProblem, fit: JointFit, n: int, max_iter: int = 40, tol: float = 1.0
+    problem: JointProblem,
+    state: JointState,
+    n: int,
+    max_iter: int = 40,
+    tol: float = 1.0,
 ) -> JointFit:
-    """Return the fit of n directions with the first noise, from one with less.
+    """Return the fit of n directions with the first noise, from a state with less.
 
     `tol` is a factor of the tolerance.
     """
-    state = fit.state
     n_more = n + 1 - len(state.shapes)
     if n_more > 0:
         _, _, n_points = state.shapes.shape
@@ -86,10 +83,9 @@ def extended(
     return free.refined(state, least_noise=FIRST_NOISE, max_iter=max_iter, tol=tol)
 
 
-def whole_distribution(problem: JointProblem, fit: JointFit) -> tuple[JointFit, Widths]:
-    """Return the fit with the variances of its directions and the noise, and these."""
-    state, widths, n_now = fit.state, None, np.inf
-    tol = problem.settings.tol
+def whole_distribution(problem: JointProblem, state: JointState) -> JointFit:
+    """Return the fit with the variances of its directions and the noise."""
+    widths, n_now, tol = None, np.inf, problem.settings.tol
     for _ in range(10):
         state, widths = determined(problem, state, widths)
         part = replace(problem, widths=widths)
@@ -98,8 +94,7 @@ def whole_distribution(problem: JointProblem, fit: JointFit) -> tuple[JointFit, 
         before, n_now = n_now, widths.shares.sum()
         if abs(n_now - before) < 0.02 * n_now + 0.1:
             break
-    assert widths is not None
-    return fit, widths
+    return fit
 
 
 def determined(
@@ -158,12 +153,9 @@ def evidence(problem: JointProblem, fit: JointFit) -> float:
     """
     part, widths = replace(problem, penalty=0.0, widths=fit.widths), fit.widths
     shapes, motion, noise = fit.state
-    cameras = problem.cameras
-    assert isinstance(cameras, CalibratedCameras)
-    n_positions = 2.0 * problem.frames.n_frames
-    objective = part.objective(cameras)._replace(n_unknowns=n_positions)
-    terms = objective(*fit.state)
-    turns = unpacked(cameras.curvature(frames_last(motion), terms.motion_curvature))
+    terms = part.objective._replace(n_unknowns=2.0 * len(motion))(*fit.state)
+    M = frames_last(motion)
+    turns = unpacked(problem.cameras.curvature(M, terms.motion_curvature))
     price = np.linalg.slogdet(frames_first(turns) / noise)[1].mean()
     views = full_rotations(motion)[0][:, 2]
     spread = np.linalg.eigvalsh(np.cov(views.T))[1:]
