@@ -180,11 +180,10 @@ def independent_gauge(
         # would count many times.
         mixing = _principal_axes(shapes[1:].mT @ space.T, alpha)
         white = np.tensordot(mixing, white, 1)
-    unmixing = np.linalg.inv(mixing).T
     if independence == "shapes":
         mixing[:K] = shared_mixing(white[:K]) @ mixing[:K]
     elif independence == "coefficients":
-        inverse = independent_coefficients((alpha @ unmixing.T)[:, :K])
+        inverse = independent_coefficients((alpha @ np.linalg.inv(mixing))[:, :K])
         mixing[:K] = np.linalg.inv(inverse).T @ mixing[:K]
     basis = np.tensordot(mixing, shapes[1:], 1).mT
     unmixing = np.linalg.inv(mixing).T
@@ -391,22 +390,17 @@ def _fixed_point(W: NDArray, Z: NDArray, n_steps: int) -> NDArray:
 def _log_density(u: NDArray, tail: NDArray, size: int) -> NDArray:
     """Return the log density F(u) of `TAILS` at squared norms u (..., n_samples)."""
     light = tail == LIGHT
-    F = -0.5 * (tail + size) * np.log1p(u / np.where(light, 1.0, tail))
-    if light.any():
-        F = np.where(light, -0.5 / (size + 2) * u * u, F)
-    return F - 0.5 * TEMPER * u
+    heavy = -0.5 * (tail + size) * np.log1p(u / np.where(light, 1.0, tail))
+    return np.where(light, -0.5 / (size + 2) * u * u, heavy) - 0.5 * TEMPER * u
 
 
 def _slopes(u: NDArray, tail: NDArray, size: int) -> tuple[NDArray, NDArray]:
     """Return F'(u) and F''(u), for u and `tail` as in `_log_density`."""
     light = tail == LIGHT
     nearness = 1.0 / (np.where(light, 1.0, tail) + u)
-    g = -0.5 * (tail + size) * nearness
-    dg = -g * nearness
-    if light.any():
-        g = np.where(light, -1.0 / (size + 2) * u, g)
-        dg = np.where(light, -1.0 / (size + 2), dg)
-    return g - 0.5 * TEMPER, dg
+    heavy = -0.5 * (tail + size) * nearness
+    g = np.where(light, -1.0 / (size + 2) * u, heavy)
+    return g - 0.5 * TEMPER, np.where(light, -1.0 / (size + 2), -heavy * nearness)
 
 
 @cache

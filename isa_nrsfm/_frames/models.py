@@ -23,12 +23,7 @@ from isa_nrsfm._frames.camera_models import (
 )
 from isa_nrsfm._frames.search import FramePosterior, FrameSearch
 from isa_nrsfm._linalg import OF_PRODUCTS, centred, frames_last, lengths
-from isa_nrsfm._prepare.robust import (
-    MEDIAN_DISTANCE,
-    frame_weights,
-    lower_medians,
-    robust_sizes,
-)
+from isa_nrsfm._prepare import robust
 from isa_nrsfm._tables import point_patterns, seen_points
 
 # Depths are not determined above this error, relative to their root mean square:
@@ -362,12 +357,13 @@ class FrameModel:
         """Return fits of rows (n, 2, J), NaN where missing, of sizes (n,)."""
         unit = rows / sizes[:, None, None]
         fit = self.posterior(unit, weights=weights)
-        if weights is None:
-            weights = seen_points(rows).astype(float)
+        weights = 1.0 * seen_points(rows) if weights is None else weights
         if self.loss != "linear":
             distance = distances(unit, self.shapes, *fit[:3])
             deviation = np.sqrt(self.noise_variance)
-            weights = frame_weights(self.loss, distance, deviation, robust_sizes(unit))
+            weights = robust.frame_weights(
+                self.loss, distance, deviation, robust.robust_sizes(unit)
+            )
         motion = fit.motion * sizes[:, None, None]
         T = derivatives(self.shapes, motion, fit.alpha, self.camera)
         share = weights / np.maximum(weights.sum(axis=1), 1e-300)[:, None]
@@ -447,8 +443,8 @@ class FrameModel:
         # residuals hardly depends on them. The threshold is as in `FrameSearch.fit`.
         fit = self._reweighted(rows, fitted)
         distance = distances(rows, self.shapes, *fit[:3])
-        median = lower_medians(distance, seen_points(rows))[:, 0]
-        poor = np.flatnonzero(median > MEDIAN_DISTANCE * np.sqrt(3.0 * noise))
+        median = robust.lower_medians(distance, seen_points(rows))[:, 0]
+        poor = np.flatnonzero(median > robust.MEDIAN_DISTANCE * np.sqrt(3.0 * noise))
         if len(poor):
             fit.put(poor, self._reweighted(rows[poor], fitted, self.starts))
         return fit
@@ -474,9 +470,9 @@ class FrameModel:
         Only the first pass starts again from `starts`: later ones go on from it.
         """
         quick = partial(fitted, covariances=False)
-        sizes, deviation = robust_sizes(rows), np.sqrt(self.noise_variance)
+        sizes, deviation = robust.robust_sizes(rows), np.sqrt(self.noise_variance)
         # First without gross outliers
-        weights = frame_weights("linear", lengths(rows), 1.0, sizes)
+        weights = robust.frame_weights("linear", lengths(rows), 1.0, sizes)
         fit = quick(rows, weights=weights, starts=starts)
         # If too few points remain, use the distant ones.
         lost = np.flatnonzero((weights == 0).any(axis=1) & np.isnan(fit.objective))
@@ -488,7 +484,7 @@ class FrameModel:
         for _ in range(50):
             part, before = rows[changing], weights[changing]
             distance = distances(part, self.shapes, *(p[changing] for p in fit[:3]))
-            new = frame_weights(self.loss, distance, deviation, sizes[changing])
+            new = robust.frame_weights(self.loss, distance, deviation, sizes[changing])
             unsettled = np.abs(new - before).max(axis=1) > 1e-4
             changing, before, new = (x[unsettled] for x in (changing, before, new))
             if not len(changing):

@@ -328,8 +328,12 @@ def determines_camera(products: FrameSums, mean_shape: NDArray) -> NDArray:
     return (products.weight > 0) & (cover > 1e-10).all(axis=1)
 
 
+# Frames, given by their sums for the shapes, and their noise variances (n,)
+FrameProblem = tuple[FrameSums, Any]
+
+
 class CoefficientPosterior(NamedTuple):
-    """Posterior of the coefficients of frames.
+    """Posterior of the coefficients of frames for cameras M (2, 3, I).
 
     c (n_shapes, I): one, and the posterior means of the coefficients. inverse (n_pairs,
     I): minus Q, packed; its row and column of the mean shape are void. objective (I,):
@@ -337,6 +341,8 @@ class CoefficientPosterior(NamedTuple):
     s2)``. image_energy (K, I): ``H_kk``, the energy of the images of the basis shapes.
     """
 
+    problem: FrameProblem
+    M: NDArray
     c: NDArray
     inverse: NDArray
     objective: NDArray
@@ -348,17 +354,21 @@ class CoefficientPosterior(NamedTuple):
         """Means of the coefficients (n_components, n_frames)."""
         return self.c[1:]
 
-    def value(self, noise: NDArray | float) -> NDArray:
-        """Return ``s2 F`` (n,)."""
-        return self.objective + noise * self.log_determinant
+    @property
+    def value(self) -> NDArray:
+        """``s2 F`` (I,)."""
+        return self.objective + self.problem[1] * self.log_determinant
 
-    def residual(self, noise: NDArray | float) -> NDArray:
-        """Return ``||W - M S||^2`` at the means."""
-        return self.objective - noise * np.einsum("ki,ki->i", self.alpha, self.alpha)
+    @property
+    def residual(self) -> NDArray:
+        """``||W - M S||^2`` (I,) at the means."""
+        alpha, noise = self.alpha, self.problem[1]
+        return self.objective - noise * np.einsum("ki,ki->i", alpha, alpha)
 
-    def spread(self, noise: NDArray | float) -> NDArray:
-        """Return ``tr(H s2 Q) = s2 (K - s2 tr Q)``, the image's posterior variance."""
-        diagonal = diagonal_of(self.inverse)[1:]
+    @property
+    def spread(self) -> NDArray:
+        """``tr(H s2 Q) = s2 (K - s2 tr Q)`` (I,), the image's posterior variance."""
+        diagonal, noise = diagonal_of(self.inverse)[1:], self.problem[1]
         return noise * (len(diagonal) + noise * self.inverse[diagonal].sum(axis=0))
 
     def covaried(self, vectors: NDArray) -> NDArray:
@@ -366,17 +376,20 @@ class CoefficientPosterior(NamedTuple):
         negative = unpacked(self.inverse[len(self.c) :])
         return -np.einsum("kli,lpi->kpi", negative, vectors)
 
-    def second_moments(self, noise: NDArray | float) -> NDArray:
+    def second_moments(self) -> NDArray:
         """Return ``E = c c^T + diag(0, s2 Q)``, packed (n_pairs, n_frames)."""
         n_shapes = len(self.c)
         moments, other = (self.c.take(side, 0) for side in pair_indices(n_shapes))
         moments *= other
-        moments[n_shapes:] -= noise * self.inverse[n_shapes:]
+        moments[n_shapes:] -= self.problem[1] * self.inverse[n_shapes:]
         return moments
 
-
-# Frames, given by their sums for the shapes, and their noise variances (n,)
-FrameProblem = tuple[FrameSums, Any]
+    def by_cameras(self, moments: NDArray) -> tuple[NDArray, NDArray]:
+        """Return A, packed (6, n), and G (2, 3, n), for packed second moments E."""
+        products = self.problem[0]
+        A = products.gram.moments(moments)
+        G = np.einsum("rbi,bai->rai", self.M, unpack3(A))
+        return A, G - np.einsum("ki,kari->rai", self.c, products.cross)
 
 
 def coefficient_posterior(
@@ -408,8 +421,8 @@ def coefficient_posterior(
         objective -= np.einsum("ki,ki->i", alpha, left)
     objective = np.maximum(objective, 0.0)  # less is rounding errors
     log_determinant = log_determinant - len(alpha) * np.log(noise)
-    c = with_one(alpha)
-    return CoefficientPosterior(c, H, objective, log_determinant, image_energy)
+    moments = with_one(alpha), H, objective, log_determinant, image_energy
+    return CoefficientPosterior(problem, M, *moments)
 
 
 def _product(packed: NDArray, vectors: NDArray) -> NDArray:
@@ -595,13 +608,13 @@ class FrameSearch:
                 problem = self.problem(products, noise[chosen[block]])
                 start = self.start(problem, initial[block].T)
                 M = self.descend(problem, start, MAX_STEPS)
-                M, posterior = self._unreversed(problem, M)
+                posterior = self._unreversed(problem, M)
                 covariance, turns = fits.covariance[block], fits.turn_covariance[block]
                 if covariances:
-                    spreads = self._covariances(problem, M, posterior)
+                    spreads = self._covariances(posterior)
                     covariance, turns = map(frames_first, spreads)
                     turns = self.space.T @ turns @ self.space
-                motion, alpha = frames_first(M), posterior.alpha.T
+                motion, alpha = frames_first(posterior.M), posterior.alpha.T
                 places = products.positions(motion, alpha)
                 kept = covariance, turns, posterior.objective
                 fit = FramePosterior(motion @ self.space, places, alpha, *kept)
@@ -644,9 +657,8 @@ class FrameSearch:
         n_steps = 6
         M = self.descend(problem, self.evaluate(problem, M), n_steps)
         # Shapes that are not fitted yet can explain a reversed frame well: try all.
-        value = coefficient_posterior(problem, M).value(problem[1])
-        every = np.arange(len(motion))
-        M, better = self._better_reversed(problem, M, value, every, n_steps)
+        posterior, every = coefficient_posterior(problem, M), np.arange(len(motion))
+        M, better = self._better_reversed(posterior, every, n_steps)
         motion = motion.copy()
         motion[better] = frames_first(M[:, :, better]) @ self.space
         return motion, better
@@ -659,10 +671,10 @@ class FrameSearch:
         The third result (n,) is the rise of -2 log L from the given cameras.
         """
         M = frames_last(motion @ self.space.T)
-        value = coefficient_posterior(problem, M).value(problem[1])
+        value = coefficient_posterior(problem, M).value
         M = self.descend(problem, self.evaluate(problem, M * REVERSED), 30)
         posterior = coefficient_posterior(problem, M)
-        rise = (posterior.value(problem[1]) - value) / problem[1]
+        rise = (posterior.value - value) / problem[1]
         return frames_first(M) @ self.space, posterior.alpha.T, rise
 
     def start(self, problem: FrameProblem, alpha: NDArray) -> State:
@@ -674,58 +686,42 @@ class FrameSearch:
         if not self.model.calibrated:
             return self.evaluate(problem, M)
         starts = calibrated_starts(self.model, M)
-        found = [coefficient_posterior(problem, M) for M in starts]
-        lower = found[1].value(problem[1]) < found[0].value(problem[1])
-        parts = (np.where(lower, b, a) for a, b in zip(*found, strict=True))
-        M, posterior = np.where(lower, *starts[::-1]), CoefficientPosterior(*parts)
-        return self._derivatives(problem, M, posterior)[0]
+        first, second = (coefficient_posterior(problem, M).value for M in starts)
+        return self.evaluate(problem, np.where(second < first, *starts[::-1]))
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``s2 F`` and its derivatives at M (2, 3, n)."""
-        posterior = coefficient_posterior(problem, position)
-        return self._derivatives(problem, position, posterior)[0]
+        return self._derivatives(coefficient_posterior(problem, position))[0]
 
-    def _derivatives(
-        self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
-    ) -> tuple[State, NDArray]:
+    def _derivatives(self, posterior: CoefficientPosterior) -> tuple[State, NDArray]:
         """Return the state at M (2, 3, n), and ``Q C`` (K, p, n), C = <D_c, F_k>."""
-        products, noise = problem
-        A = products.gram.moments(posterior.second_moments(noise))
-        G = np.einsum("rbi,bai->rai", M, unpack3(A))
-        G -= np.einsum("ki,kari->rai", posterior.c, products.cross)
+        M = posterior.M
+        A, G = posterior.by_cameras(posterior.second_moments())
         gradient, definite = self.model.gradient(M, G), self.model.curvature(M, A)
         # The coefficients follow: - sum_kl <D_c, F_k> Q_kl <D_d, F_l>
-        coupling = self.model.gradient(M, _changes(products, M, posterior))
+        coupling = self.model.gradient(M, _changes(posterior))
         through = posterior.covaried(coupling)
         hessian = definite + self.model.second(M, G, gradient)
         hessian -= packed_products(through.swapaxes(0, 1), coupling.swapaxes(0, 1))
-        return State(M, posterior.value(noise), -gradient, definite, hessian), through
+        return State(M, posterior.value, -gradient, definite, hessian), through
 
-    def _unreversed(
-        self, problem: FrameProblem, M: NDArray
-    ) -> tuple[NDArray, CoefficientPosterior]:
-        """Return cameras (2, 3, n), or minima from reversed ones where these are lower.
-
-        With their posterior.
-        """
+    def _unreversed(self, problem: FrameProblem, M: NDArray) -> CoefficientPosterior:
+        """Return the posterior for cameras (2, 3, n), or for lower reversed minima."""
         posterior = coefficient_posterior(problem, M)
         if not self.model.calibrated:
-            return M, posterior
-        value, rise = posterior.value(problem[1]), _rise(problem, M, posterior)
-        tried = np.flatnonzero(~(rise > LARGE_RISE * value))
-        M, better = self._better_reversed(problem, M, value, tried, MAX_STEPS)
-        return M, coefficient_posterior(problem, M) if better.any() else posterior
+            return posterior
+        tried = np.flatnonzero(~(_rise(posterior) > LARGE_RISE * posterior.value))
+        M, better = self._better_reversed(posterior, tried, MAX_STEPS)
+        return coefficient_posterior(problem, M) if better.any() else posterior
 
-    def _covariances(
-        self, problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
-    ) -> tuple[NDArray, NDArray]:
+    def _covariances(self, posterior: CoefficientPosterior) -> tuple[NDArray, NDArray]:
         """Return the covariances of coefficients (K, K, n) and of rotations (3, 3, n).
 
         They come from the inverse joint Hessian ``s2 (Q + Q C^T Y^-1 C Q)``. C is the
         coupling, Y the Hessian by the camera with the coefficients eliminated.
         """
-        noise = problem[1]
-        state, through = self._derivatives(problem, M, posterior)
+        noise = posterior.problem[1]
+        state, through = self._derivatives(posterior)
         inverse = state.inverse()
         widened = np.einsum("kci,cdi->kdi", through, inverse)
         covariance = np.einsum("kdi,ldi->kli", widened, through)
@@ -735,18 +731,14 @@ class FrameSearch:
         return noise * covariance, np.broadcast_to(turns, (3, 3, len(noise)))
 
     def _better_reversed(
-        self,
-        problem: FrameProblem,
-        M: NDArray,
-        value: NDArray,
-        tried: NDArray,
-        max_steps: int,
+        self, posterior: CoefficientPosterior, tried: NDArray, max_steps: int
     ) -> tuple[NDArray, NDArray]:
         """Return cameras (2, 3, n), or minima from reversed ones where these are lower.
 
-        Cameras M have the objectives value (n,); the indices of those to reverse are
-        `tried`. Also returns a mask (n,) of replaced cameras.
+        The indices of those to reverse are `tried`. Also returns a mask (n,) of
+        replaced cameras.
         """
+        problem, M, value = posterior.problem, posterior.M, posterior.value
         limit = value - 1e-10 * scale_of(problem)
         cameras, better = M.copy(), np.zeros(len(value), dtype=bool)
         tried = padded(tried)
@@ -756,7 +748,7 @@ class FrameSearch:
             # The reversed camera and M differ in the third column.
             radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])
             other = self.descend(problem, start, max_steps, (M, limit, radius))
-            reached = coefficient_posterior(problem, other).value(problem[1])
+            reached = coefficient_posterior(problem, other).value
             better[tried] = lower = reached < limit
             cameras[..., tried] = np.where(lower, other, M)
         return cameras, better
@@ -859,9 +851,7 @@ def _completed(M: NDArray) -> tuple[NDArray, NDArray]:
     return np.concatenate([N, z[:, None]], axis=1), scale
 
 
-def _rise(
-    problem: FrameProblem, M: NDArray, posterior: CoefficientPosterior
-) -> NDArray:
+def _rise(posterior: CoefficientPosterior) -> NDArray:
     """Return the least rise (n,) of the objective on the way to the reversed camera.
 
     A reversal turns the third column z of M (2, 3, n) over. On the way ``<z', z> = 0``.
@@ -869,9 +859,9 @@ def _rise(
     ``e = (0, 0, z) / |z|``, in the quadratic approximation with half the Hessian Y.
     This neglects the gradient at M, and Y bounds the log determinant from above.
     """
-    (products, noise), K, n = problem, len(posterior.alpha), M.shape[2]
-    F = _changes(products, M, posterior).reshape(K, 6, n)
-    A = products.gram.moments(posterior.second_moments(noise))
+    M, K, n = posterior.M, len(posterior.alpha), posterior.M.shape[2]
+    F = _changes(posterior).reshape(K, 6, n)
+    A = posterior.problem[0].gram.moments(posterior.second_moments())
     Y = CAMERAS["affine"].curvature(M, A)
     Y -= packed_products(posterior.covaried(F).swapaxes(0, 1), F.swapaxes(0, 1))
     z = (M * (REVERSED < 0)).reshape(6, n)
@@ -883,12 +873,11 @@ def _rise(
     return np.where(definite, square / variance, 0.0)
 
 
-def _changes(
-    products: FrameSums, M: NDArray, posterior: CoefficientPosterior
-) -> NDArray:
-    """Return ``F_k`` (K, 2, 3, n) of the basis shapes for cameras M (2, 3, n)."""
+def _changes(posterior: CoefficientPosterior) -> NDArray:
+    """Return ``F_k`` (K, 2, 3, n) of the basis shapes for the cameras."""
+    products = posterior.problem[0]
     changes = unpack3(products.gram.products(posterior.c)[1:])
-    F = np.einsum("rbi,kbai->krai", M, changes)
+    F = np.einsum("rbi,kbai->krai", posterior.M, changes)
     F -= products.cross[1:].swapaxes(1, 2)
     return F
 

@@ -25,15 +25,7 @@ from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import compose, full_rotations
 from isa_nrsfm._frames.models import FrameModel
-from isa_nrsfm._joint.consensus import (
-    LEFT,
-    MOST_COMPONENTS,
-    MOST_POINTS,
-    aligning_rotations,
-    frames_showing,
-    interpolation,
-    principal_shapes,
-)
+from isa_nrsfm._joint import consensus
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import JointProblem, JointState, Widths
 from isa_nrsfm._joint.settings import FitSettings
@@ -64,7 +56,7 @@ def bagged(
         return None
     part, fit, w = inlying_rows(model, table.rows, MOST_FRAMES, table.weights)
     n_points = part.shape[2]
-    chosen = spread(np.arange(n_points), MOST_POINTS)
+    chosen = spread(np.arange(n_points), consensus.MOST_POINTS)
     # A fit with noise ends at its floor or above it, up to rounding.
     exact = model.noise_variance < 0.5 * LEAST_NOISE * np.nanmean(part**2)
     if exact or len(chosen) < 2 * N_GROUPS:
@@ -74,16 +66,16 @@ def bagged(
 
     def fitted(points: NDArray) -> tuple[NDArray, NDArray]:
         """Return the frames that show enough of the points, and their depths."""
-        frames = frames_showing(part[:, :, points])
+        frames = consensus.frames_showing(part[:, :, points])
         counts = None if w is None else w[np.ix_(frames, points)]
-        tracks = JointFrames.of_rows(part[np.ix_(frames, range(2), points)], counts)
+        tracks = JointFrames.of_rows(part[np.ix_(frames, np.arange(2), points)], counts)
         part_widths = widths.of_points(len(points), n_directions)
         problem = JointProblem(tracks, settings, widths=part_widths)
         shapes = centred(model.shapes[: n_directions + 1, :, points])
         state = JointState(shapes, fit.motion[frames], model.noise_variance)
         limits: Any = {"max_iter": MOST_STEPS, "tol": settings.tol}
         state = problem.refined(state, least_noise=LEAST_NOISE, **limits).state
-        return frames, centred(state.depths(problem.likelihood(*state).alpha))
+        return frames, centred(problem.depths(state))
 
     # Depths of the joint fit, and changes of them
     rotations, scales = full_rotations(fit.motion)
@@ -104,13 +96,15 @@ def bagged(
     change = centred(change / np.maximum(count, 1))
     counted = count.any(axis=1, keepdims=True)
     change -= counted * (change.sum(axis=0) / max(counted.sum(), 1))
-    change = change @ interpolation(model.shapes[0], chosen) / scales[:, None]
+    change = change @ consensus.interpolation(model.shapes[0], chosen) / scales[:, None]
     S = S + rotations[:, 2, :, None] * change[:, None]
     # The model of the changed shapes
     noise = model.noise_variance
-    R = aligning_rotations(centred(S[:, :, chosen]), noise)
-    n_max = min(3 * n_points - 7, MOST_COMPONENTS)
-    shapes, _, remainder = principal_shapes(centred(R.mT @ S), n_max, LEFT * noise)
+    R = consensus.aligning_rotations(centred(S[:, :, chosen]), noise)
+    n_max = min(3 * n_points - 7, consensus.MOST_COMPONENTS)
+    shapes, _, remainder = consensus.principal_shapes(
+        centred(R.mT @ S), n_max, consensus.LEFT * noise
+    )
     problem = JointProblem(JointFrames.of_rows(part, w), settings)
     state = JointState(shapes, fit.motion @ R, noise)
     state, widths = determined(problem, state, None)

@@ -41,15 +41,7 @@ from scipy.spatial.distance import cdist
 from sklearn.utils.parallel import Parallel, delayed
 
 from isa_nrsfm._compat.scikit_learn import one_blas_thread
-from isa_nrsfm._frames.camera_models import (
-    CAMERAS,
-    AffineCameras,
-    compose,
-    full_rotations,
-    residuals,
-    rotated,
-    turning,
-)
+from isa_nrsfm._frames import camera_models
 from isa_nrsfm._frames.models import NOT_ESTIMATED, FrameModel
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import JointFit, JointState, refine_joint
@@ -141,7 +133,7 @@ def common_coordinates(
         Y += change
         for R, points, w, inverse, mixed in turns:
             pull = np.einsum("ajki,jai->ki", mixed, _of_group(change, points))
-            R[:] = rotated(R, w - np.einsum("kli,li->ki", inverse, pull))
+            R[:] = camera_models.rotated(R, w - np.einsum("kli,li->ki", inverse, pull))
     return np.ascontiguousarray(Y.transpose(2, 1, 0))
 
 
@@ -152,7 +144,7 @@ def aligning_rotations(S: NDArray, s2: float) -> NDArray:
     """
     R = np.repeat(np.eye(3)[:, :, None], len(S), axis=2)
     for _ in range(STEPS):
-        R = rotated(R, _turns(np.einsum("iaj,abi->jbi", S, R), s2)[-1])
+        R = camera_models.rotated(R, _turns(np.einsum("iaj,abi->jbi", S, R), s2)[-1])
     return frames_first(R)
 
 
@@ -164,7 +156,7 @@ def _turns(shapes: NDArray, s2: float) -> tuple[NDArray, ...]:
     (3, I).
     """
     precision, slope = _principal(shapes, s2)
-    D = turning(shapes).reshape(3, len(precision), -1)
+    D = camera_models.turning(shapes).reshape(3, len(precision), -1)
     pulled = precision @ D
     inverse = inverse3(np.einsum("kai,lai->kli", D, pulled)[ROWS, COLUMNS])
     w = np.einsum("kai,ai->ki", D, slope.reshape(len(precision), -1))
@@ -261,6 +253,11 @@ class Group(NamedTuple):
     noise: float
     start: int = 0
 
+    def differences(self, depths: NDArray) -> NDArray:
+        """Return differences (n_frames, n) from depths (I, J), up to their means."""
+        own_depths = depths[np.ix_(self.frames, self.points)]
+        return centred(self.coordinates[:, 2] - own_depths)
+
 
 def consensus(
     model: FrameModel,
@@ -278,8 +275,8 @@ def consensus(
     """
     part, fit, _ = inlying_rows(model, table.rows, MOST_FRAMES)
     # Shapes of the joint fit, in the axes of the object and of the cameras
-    shapes = compose(model.shapes[0], model.shapes[1:], fit.alpha)
-    rotations, scales = full_rotations(fit.motion)
+    shapes = camera_models.compose(model.shapes[0], model.shapes[1:], fit.alpha)
+    rotations, scales = camera_models.full_rotations(fit.motion)
     first = scales[:, None, None] * rotations @ shapes
     first[:, :2] += fit.translation[:, :, None]
     # Groups of some of the points
@@ -306,7 +303,7 @@ def consensus(
         if settings.on_step is not None:
             settings.on_step()
         if result is not None:
-            groups.append(Group(points, weight, *result, start))
+            groups.append(Group(points, weight, *result)._replace(start=start))
     n_max = min(3 * n_points - 7, MOST_COMPONENTS)
 
     def modelled(S: NDArray, noise: float) -> FrameModel:
@@ -370,7 +367,7 @@ def hidden_residuals(model: FrameModel, rows: NDArray) -> NDArray:
     for first in range(5):
         hidden = np.arange(rows.shape[2]) % 5 == first
         fit = model.posterior_without(rows, hidden)
-        residual = residuals(rows, model.shapes, fit.motion, fit.alpha)
+        residual = camera_models.residuals(rows, model.shapes, fit.motion, fit.alpha)
         errors[:, :, hidden] = (residual - fit.translation[:, :, None])[:, :, hidden]
     return errors
 
@@ -402,8 +399,7 @@ def disagreements(groups: list[Group], depths: NDArray) -> NDArray:
     """Return mean squared differences (n,) of the groups from the depths (I, n)."""
     squares, weight = np.zeros((2, depths.shape[1]))
     for group in groups:
-        reference = depths[np.ix_(group.frames, group.points)]
-        difference = centred(group.coordinates[:, 2]) - centred(reference)
+        difference = group.differences(depths)
         squares[group.points] += group.weight * np.sum(difference**2, axis=0)
         weight[group.points] += group.weight * len(difference)
     # Points of no fitted group have the mean error of the others.
@@ -508,18 +504,19 @@ def group_fit(
     free, (n_seen, square) = MarginalLikelihood(part), part.totals
     least_noise, tol = scene.floor * n_seen / square, 0.3 * settings.tol
     refined = partial(refine_joint, least_noise=least_noise, tol=tol)
-    start = refined(free, start, AffineCameras(held=True), max_iter=FREE_STEPS).state
+    held = camera_models.AffineCameras(held=True)
+    start = refined(free, start, held, max_iter=FREE_STEPS).state
     # With the prior, and a rotation of the group in each frame
     penalty = scene.price / len(frames)
     likelihood, alpha = MarginalLikelihood(part, penalty), free(*start).alpha
     shapes = likely_basis(start.shapes, motion, alpha, penalty)
-    start, orthographic = start._replace(shapes=shapes), CAMERAS["orthographic"]
-    max_iter = min(settings.max_iter, MOST_STEPS)
+    start, cameras = start._replace(shapes=shapes), camera_models.CAMERAS
+    orthographic, max_iter = cameras["orthographic"], min(settings.max_iter, MOST_STEPS)
     state = refined(likelihood, start, orthographic, max_iter=max_iter).state
     alpha = likelihood(*state).alpha
-    rotations, scales = full_rotations(state.motion)
+    rotations, scales = camera_models.full_rotations(state.motion)
     turned = scales[:, None, None] * rotations
-    S = turned @ compose(state.shapes[0], state.shapes[1:], alpha)
+    S = turned @ camera_models.compose(state.shapes[0], state.shapes[1:], alpha)
     # Positions from the visible points, and the mirror image nearest to the joint fit
     sums = np.where(seen[:, None], tracks - S[:, :2], 0.0).sum(axis=2)
     S[:, :2] += (sums / seen.sum(axis=1)[:, None])[:, :, None]
@@ -546,10 +543,7 @@ def weighted(scene: Scene, groups: list[Group]) -> list[Group]:
         merged = merge(scene, same)[:, 2]
         for start in sorted({group.start for group in same}):
             kind = [group for group in same if group.start == start]
-            squares = []
-            for group in kind:
-                depths = merged[np.ix_(group.frames, group.points)]
-                squares.append(np.mean(centred(group.coordinates[:, 2] - depths) ** 2))
+            squares = [np.mean(group.differences(merged) ** 2) for group in kind]
             square = np.average(squares, weights=[group.weight for group in kind])
             factor = 1.0 / (size * (square + rounding))
             weighted_groups += [g._replace(weight=factor * g.weight) for g in kind]

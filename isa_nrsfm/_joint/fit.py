@@ -34,6 +34,7 @@ from isa_nrsfm._frames.models import (
     derivatives,
     spread_starts,
 )
+from isa_nrsfm._joint import starts
 from isa_nrsfm._joint.likelihood import JointFrames, WeightedRows, without
 from isa_nrsfm._joint.prior import SETTLED_WIDTH, TOL_SHARE, ShapePrior
 from isa_nrsfm._joint.problem import (
@@ -45,20 +46,6 @@ from isa_nrsfm._joint.problem import (
     regular,
 )
 from isa_nrsfm._joint.settings import FitSettings
-from isa_nrsfm._joint.starts import (
-    FIXED_STEPS,
-    affine_start,
-    best_starts,
-    both_sides,
-    flat_cameras,
-    held_fit,
-    lifted_shapes,
-    other_depths,
-    reversed_groups,
-    steadied,
-    unfolded,
-    with_prior,
-)
 from isa_nrsfm._joint.whole import (
     FAR_FRAMES,
     FEW_DIRECTIONS,
@@ -113,7 +100,7 @@ def fit_jointly(
     """
     every_point = table.scaled.complete and table.scaled.weights is None
     problems = _problems(table, paper_shapes, settings)
-    first, whole = next(problems), settings.all_directions
+    first, all_directions = next(problems), settings.all_directions
     few_directions = partial(n_directions, first, paper_shapes.shape[2])
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is not None:
@@ -121,21 +108,21 @@ def fit_jointly(
         if not len(start.motion):
             start = first.aligned(start)
         if settings.prior is None:  # a fit without the prior has larger basis shapes
-            start = with_prior(first, start)
+            start = starts.with_prior(first, start)
         # The widths of a prior change its first fit. All directions have another one.
-        rough: dict[str, Any] = {"max_iter": 0} if whole else {}
+        rough: dict[str, Any] = {"max_iter": 0} if all_directions else {}
         if settings.prior is not None:
             rough = {"tol": settings.tol / TOL_SHARE}
         fit = first.unreversed(start, **rough)
-        if whole:
+        if all_directions:
             fit = extended(first, fit.state, few_directions(few=True))
-    elif whole:
+    elif all_directions:
         fit = _likeliest_fit(first, table, paper_shapes)
     else:
         fit, start = _first_fit(first, table, paper_shapes)
     ratio, rivals, penalty = fit.camera_noise_ratio, 0.0, first.penalty
     least_noise, sufficient = settings.limits.least_noise, False
-    if whole:
+    if all_directions:
         fit = steadiest(first, table, fit)
         rivals = fit.rivals
         # More directions, if the table supports all of the first ones
@@ -161,13 +148,13 @@ def fit_jointly(
         tol = 0.1**2 * settings.tol
         fit = problem.refined(fit.state, least_noise=least_noise, tol=tol)
     # Fits of larger samples, and of all frames; for robust losses see `reweighted`
-    starts = None
+    further = None
     if table.parts and table.outliers is None:
-        starts = spread_starts(problem.likelihood(*fit.state).alpha)
+        further = spread_starts(problem.likelihood(*fit.state).alpha)
     for larger in problems:
         problem = of_all(larger)
         if table.outliers is None:
-            state = problem.aligned(fit.state, starts)
+            state = problem.aligned(fit.state, further)
             fit = problem.refined(state, least_noise=least_noise)
     n_pose = 2 + first.cameras.n_parameters
     if table.compressed and table.outliers is None and not every_point:
@@ -265,16 +252,15 @@ def steadiest(
     there; `evidence` counts both. Further ones start from a flat mean shape, or have
     groups of frames turned back in depth (`reversed_groups`).
     """
-    W = problem.frames.coordinates(table.W)
-    rows = W.reshape(problem.frames.n_frames, 2, -1)
+    frames = problem.frames
+    rows = frames.coordinates(table.W).reshape(frames.n_frames, 2, -1)
     n = min(len(first.state.shapes) - 1, FEW_DIRECTIONS)
     n_first = min(FIRST_COMPONENTS[0], n)
     before = evidence(problem, first)
     fit = whole_distribution(problem, first.state)
-    restarts = problem.settings.limits.restarts
-    if not restarts or not np.isfinite(before):  # nothing turns
+    if not (problem.settings.limits.restarts and np.isfinite(before)):  # nothing turns
         return fit
-    least_gain = LEAST_GAIN * problem.frames.totals[0] / problem.frames.n_frames
+    least_gain = LEAST_GAIN * frames.totals[0] / frames.n_frames
     found, latest = [(evidence(problem, fit) - least_gain, before, fit)], fit
 
     def expanded(state: JointState) -> JointFit:
@@ -286,8 +272,8 @@ def steadiest(
 
     def lifted(motion: NDArray, k: int) -> JointState:
         """Return a state of k directions that fit cameras."""
-        shapes = lifted_shapes(rows, motion, k)
-        return held_fit(problem, rows, motion, shapes).state
+        shapes = starts.lifted_shapes(rows, motion, k)
+        return starts.held_fit(problem, rows, motion, shapes).state
 
     def compare(other: JointFit, margin: float) -> None:
         """Add a fit, if it may be the most evident one."""
@@ -297,7 +283,7 @@ def steadiest(
             found.append((evidence(problem, other), at_first, other))
 
     for _ in range(4):
-        motion, tried = steadied(latest.state.motion), len(found)
+        motion, tried = starts.steadied(latest.state.motion), len(found)
         for k in {n_first, n}:
             compare(expanded(lifted(motion, k)), HOPELESS)
         if len(found) == tried:
@@ -305,8 +291,8 @@ def steadiest(
         latest = min(found[tried:], key=itemgetter(0))[2]
 
     best = min(found, key=itemgetter(0))[2]
-    if both_sides(best.state):
-        motion = flat_cameras(problem, best.state)
+    if starts.both_sides(best.state):
+        motion = starts.flat_cameras(problem, best.state)
         compare(expanded(lifted(motion, n_first)), HOPELESS)
         # Few directions lead out of minima where others explain wrong cameras.
         for k in AGAIN:
@@ -316,7 +302,9 @@ def steadiest(
     for n_groups in GROUPS:
         _, before, best = min(found, key=itemgetter(0))
         alpha = replace(problem, widths=best.widths).likelihood(*best.state).alpha
-        motion = reversed_groups(problem, rows, best.state.motion, alpha, n_groups)
+        motion = starts.reversed_groups(
+            problem, rows, best.state.motion, alpha, n_groups
+        )
         if np.any(motion != best.state.motion):
             compare(problem.turned_back(lifted(motion, n), expanded), -least_gain)
     found.sort(key=itemgetter(0))
@@ -324,7 +312,7 @@ def steadiest(
     rivals = rival_depths(problem, [(value, fit) for value, _, fit in found])
     # A flat object may have relief to both sides. All choices of a side for each frame
     # are equally likely then.
-    compare(expanded(unfolded(best.state, n)), HOPELESS)
+    compare(expanded(starts.unfolded(best.state, n)), HOPELESS)
     for value, _, flat in found[n_found:]:
         sides = [(evidence(problem, best), best), (value - 2.0 * np.log(2.0), flat)]
         rivals += rival_depths(problem, sides)
@@ -379,12 +367,12 @@ def _first_fit(
     first = problem if calibrated else weak
     fit, start = _calibrated_fit(first, table, paper_shapes, **limits)
     # Affine cameras, from the calibrated fit and from the paper's result
-    rigid = affine_start(problem, table.W, paper_shapes)
+    rigid = starts.affine_start(problem, table.W, paper_shapes)
     # Some steps without the prior: with the large noise of a start it would make basis
     # shapes vanish.
     free = replace(affine, penalty=0.0)
-    state = free.refined(rigid, max_iter=FIXED_STEPS, tol=settings.tol).state
-    states = [fit.state, with_prior(problem, state)]
+    state = free.refined(rigid, max_iter=starts.FIXED_STEPS, tol=settings.tol).state
+    states = [fit.state, starts.with_prior(problem, state)]
     # With calibrated cameras, affine ones are only compared.
     max_iter = min(settings.max_iter, 60) if calibrated else settings.max_iter
     if not problem.thorough:  # only the better one continues
@@ -400,9 +388,9 @@ def _calibrated_fit(
     problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray, **limits: Any
 ) -> tuple[JointFit, JointState]:
     """Return the fit of calibrated cameras from the best starts, and the best start."""
-    starts = best_starts(problem, table, paper_shapes)
+    states = starts.best_starts(problem, table, paper_shapes)
     refined = partial(problem.unreversed, **limits)
-    return min(map(refined, starts), key=_end), starts[0]
+    return min(map(refined, states), key=_end), states[0]
 
 
 def _end(fit: JointFit) -> float:
@@ -467,7 +455,7 @@ def explained(
 def unregularised(problem: JointProblem, state: JointState) -> JointFit:
     """Return the fit without prior and floor. It ends when the noise hardly falls."""
     problem = replace(problem, penalty=0.0)
-    state = with_prior(problem, state)
+    state = starts.with_prior(problem, state)
     max_iter = problem.settings.max_iter
     steps = min(60, max_iter)
     for _ in range(max_iter // steps):
@@ -521,7 +509,7 @@ def deepened(problem: JointProblem, fit: JointFit) -> JointFit:
     prior, n = fit.prior, problem.frames.n_frames / FAR_FRAMES
     assert prior is not None
     found = [(_end(fit) / n + 0.5 * prior.cost, fit)]
-    for start, other, _ in other_depths(fit.state, problem.cameras, prior):
+    for start, other, _ in starts.other_depths(fit.state, problem.cameras, prior):
         trial = problem.with_prior(other).unreversed(start)
         found.append((_end(trial) / n + 0.5 * other.cost, trial))
     best = min(found, key=itemgetter(0))[1]

@@ -291,17 +291,15 @@ class MarginalLikelihood(NamedTuple):
         penalty = np.reshape(self.penalty, (-1, 1))
         value = np.sum(posterior.objective / noise + posterior.log_determinant)
         value += np.sum(penalty * posterior.image_energy)
-        residual = float(posterior.residual(noise).sum())
-        spread = float(posterior.spread(noise).sum())
+        residual = float(posterior.residual.sum())
+        spread = float(posterior.spread.sum())
 
         # Second moments E of c. The penalty acts as if E_kk were larger by s2 penalty.
-        moments = posterior.second_moments(noise)
+        moments = posterior.second_moments()
         moments[linalg.diagonal_of(moments)[1:]] += noise * penalty
         cameras = camera_gram(M)
         # By the cameras: M A - sum_k c_k P_k^T with A = sum_kl E_kl B_k B_l^T
-        motion_curvature = products.gram.moments(moments)
-        G = np.einsum("rbi,bai->rai", M, linalg.unpack3(motion_curvature))
-        G -= np.einsum("ki,kari->rai", c, products.cross)
+        motion_curvature, G = posterior.by_cameras(moments)
         # By the shapes: sum_i X_i^T W_i with X_i = c_i^T (x) M_i
         X = (c[:, None, None] * M.swapaxes(0, 1)).reshape(3 * n_shapes, -1)
         shape_gradient = X @ block.deviations.reshape(n_points, -1).T

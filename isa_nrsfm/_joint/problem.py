@@ -231,6 +231,11 @@ class JointProblem:
         free = self.cameras.name == "affine" or self.settings.shape_prior is not None
         return self.likelihood._replace(extent_weight=0.0 if free else EXTENT_WEIGHT)
 
+    def depths(self, state: JointState) -> NDArray:
+        """Return the centred depths (I, J) at the means of the coefficients."""
+        alpha = self.likelihood(*state).alpha
+        return state._replace(shapes=self.frames.points(state.shapes)).depths(alpha)
+
     def aligned(self, state: JointState, starts: NDArray | None = None) -> JointState:
         """Return a state with the best cameras of these frames for its centred shapes.
 
@@ -257,7 +262,7 @@ class JointProblem:
 
     def unreversed(self, state: JointState, **limits: Any) -> JointFit:
         """Refine a state; with calibrated cameras no frame stays reversed in depth."""
-        refined = partial(self.refined, **limits)
+        refined: Callable[..., JointFit] = partial(self.refined, **limits)
         calibrated = self.thorough and self.cameras.calibrated
         return self.turned_back(state, refined) if calibrated else refined(state)
 

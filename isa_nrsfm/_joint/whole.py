@@ -25,7 +25,6 @@ vanishes as soon as there are enough directions to explain a frame by them.
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._joint.problem import JointFit, JointProblem, JointState, Widths, regular
@@ -176,18 +175,11 @@ def rival_depths(problem: JointProblem, fits: list[tuple[float, JointFit]]) -> f
     Relative to the mean square, each with its probability ``exp(-m (e - e_0))`` by the
     evidence e of m = `FAR_FRAMES` frames, and mirrored if that is nearer.
     """
-    (best, first), *other_fits = fits
-    z, total = depths_of(problem, first), 0.0
-    for value, fit in other_fits:
-        other = depths_of(problem, fit)
+    best, total = fits[0][0], 0.0
+    parts = ((replace(problem, widths=fit.widths), fit.state) for _, fit in fits)
+    z, *others = (part.depths(state) for part, state in parts)
+    for (value, _), other in zip(fits[1:], others, strict=True):
         other *= np.copysign(1.0, np.sum(other * z))
         square = np.sum((other - z) ** 2) / np.sum(z**2)
         total += np.exp(-FAR_FRAMES * max(value - best, 0.0)) * square
     return float(total)
-
-
-def depths_of(problem: JointProblem, fit: JointFit) -> NDArray:
-    """Return the centred depths (I, J) of a fit of all directions."""
-    state, part = fit.state, replace(problem, widths=fit.widths)
-    alpha = part.likelihood(*state).alpha
-    return state._replace(shapes=problem.frames.points(state.shapes)).depths(alpha)
