@@ -430,8 +430,7 @@ class Pinhole(NamedTuple):
         """Return the shapes' origins (n, 3) in the axes of the real camera."""
         _, scales = full_rotations(motion)
         f = np.full(len(motion), self.focal_length)
-        place = np.column_stack([translation - self.centre[:, 0], f])
-        return place / scales[:, None]
+        return np.column_stack([translation - self.centre[:, 0], f]) / scales[:, None]
 
 
 def pinhole_of(focal_length: Any, point: Any, *kind: bool) -> Pinhole:

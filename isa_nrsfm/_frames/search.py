@@ -611,8 +611,7 @@ class FrameSearch:
                 posterior = self._unreversed(problem, M)
                 covariance, turns = fits.covariance[block], fits.turn_covariance[block]
                 if covariances:
-                    spreads = self._covariances(posterior)
-                    covariance, turns = map(frames_first, spreads)
+                    covariance, turns = map(frames_first, self._covariances(posterior))
                     turns = self.space.T @ turns @ self.space
                 motion, alpha = frames_first(posterior.M), posterior.alpha.T
                 places = products.positions(motion, alpha)
@@ -748,8 +747,7 @@ class FrameSearch:
             # The reversed camera and M differ in the third column.
             radius = SAME_WELL * 2.0 * np.hypot(M[0, 2], M[1, 2])
             other = self.descend(problem, start, max_steps, (M, limit, radius))
-            reached = coefficient_posterior(problem, other).value
-            better[tried] = lower = reached < limit
+            better[tried] = lower = coefficient_posterior(problem, other).value < limit
             cameras[..., tried] = np.where(lower, other, M)
         return cameras, better
 

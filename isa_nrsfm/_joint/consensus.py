@@ -606,10 +606,10 @@ def principal_shapes(
     left = np.append(np.cumsum(energy[::-1])[::-1], 0.0)
     enough = int(np.argmax(left <= noise)) if noise > 0 else most
     n_components = min(max(enough, 1), most)
-    basis = np.zeros((n_components, *mean_shape.shape))
-    alpha = np.zeros((len(S), n_components))
-    n = min(n_components, len(values))
-    basis[:n] = (values[:n, None] * Vt[:n]).reshape(n, *mean_shape.shape)
-    basis /= np.sqrt(len(S))
-    alpha[:, :n] = np.sqrt(len(S)) * U[:, :n]
+    # Components beyond the rank are zero.
+    n, root = min(n_components, len(values)), np.sqrt(len(S))
+    beyond = 0, n_components - n
+    basis = np.pad(values[:n, None] * Vt[:n] / root, (beyond, (0, 0)))
+    alpha = np.pad(root * U[:, :n], ((0, 0), beyond))
+    basis = basis.reshape(-1, *mean_shape.shape)
     return np.concatenate([mean_shape[None], basis]), alpha, float(left[n])

@@ -231,8 +231,7 @@ def other_fits(
     state = joint.state._replace(shapes=joint.state.shapes[: n + 1])
     state = _of_sample(problem, table, state)
     best = evidence(problem, extended(problem, state, n))
-    n_max = min(len(paper) - 1, n)
-    for k in dict.fromkeys(min(k, n_max) for k in OTHER_COMPONENTS):
+    for k in dict.fromkeys(min(k, len(paper) - 1, n) for k in OTHER_COMPONENTS):
         fit, _ = _calibrated_fit(problem, table, paper[: k + 1], tol=settings.tol)
         fit = extended(problem, fit.state, n)
         weight = float(np.exp(min(best - evidence(problem, fit), 0.0) / 2.0))
@@ -389,8 +388,7 @@ def _calibrated_fit(
 ) -> tuple[JointFit, JointState]:
     """Return the fit of calibrated cameras from the best starts, and the best start."""
     states = starts.best_starts(problem, table, paper_shapes)
-    refined = partial(problem.unreversed, **limits)
-    return min(map(refined, states), key=_end), states[0]
+    return min((problem.unreversed(s, **limits) for s in states), key=_end), states[0]
 
 
 def _end(fit: JointFit) -> float:

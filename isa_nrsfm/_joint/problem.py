@@ -71,8 +71,7 @@ class FactorisedTable(NamedTuple):
     def rest_share(self, n: int) -> float:
         """Return the share of the energy outside of the n leading singular values."""
         squares = self.singular_values**2
-        remainder = np.sum(squares[n:]) + self.rest
-        return float(remainder / (np.sum(squares) + self.rest))
+        return float((np.sum(squares[n:]) + self.rest) / (np.sum(squares) + self.rest))
 
     def noise_level(self, n_components: int) -> float:
         """Return the noise variance of the spectrum as a share of the mean square.
@@ -125,8 +124,7 @@ class Widths(NamedTuple):
 
     def of_points(self, n_points: int, n_directions: int) -> "Widths":
         """Return the widths of the first directions of some of the points."""
-        parts = [each[:n_directions] for each in self[:3]]
-        return Widths._make([*parts, 3 * n_points])
+        return Widths._make([*(each[:n_directions] for each in self[:3]), 3 * n_points])
 
     def padded(self, n_more: int) -> "Widths":
         """Return the widths with further directions, of which nothing is known."""
@@ -360,8 +358,7 @@ def refine_joint(
         # Convergence test
         gain = iterate.value - reached.value
         rounding = OF_SUMS * square / reached.state.noise
-        small = gain < max(tol * n_frames, rounding)
-        small_steps = small_steps + 1 if small else 0
+        small_steps = small_steps + 1 if gain < max(tol * n_frames, rounding) else 0
         iterate = reached
         history.append(iterate.value)
     memory.clear()

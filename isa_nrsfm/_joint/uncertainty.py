@@ -288,15 +288,14 @@ def depth_certainty(
     def refit(
         kept: NDArray,
         start: JointState | None = None,
-        extents: float = 0.0,
         prior: ShapePrior | None = prior,
-        of_images: NDArray | None = None,
+        **changes: Any,
     ) -> tuple[JointState, NDArray, NDArray, float]:
         """Fit the kept points by a few steps, by default from the fit of all points.
 
         Returns the state, rotations (I, 3, 3), centred depths (I, n_kept) and the
-        objective for each frame, without the prior of the extents. of_images: factors
-        of a prior of the images of the directions, in place of that of their points.
+        objective for each frame, without the prior of the extents. `changes` are those
+        of the likelihood.
         """
         counts = None if w is None else w[:, kept]
         part = JointFrames.of_rows(tracks[:, :, kept], counts)
@@ -309,11 +308,9 @@ def depth_certainty(
         elif widths is not None:
             part_widths = widths.of_points(int(kept.sum()), n_max)
             likelihood = part_widths.likelihood(part, frames.camera)
-            if of_images is not None:
-                likelihood = likelihood._replace(precisions=None, penalty=of_images)
         else:
             likelihood = MarginalLikelihood(part, part.basis_penalty(limits.basis_std))
-        likelihood = likelihood._replace(extent_weight=extents)
+        likelihood = likelihood._replace(**changes)
         floor = min(noise * n_numbers / energy, limits.least_noise)
         start = start._replace(noise=noise)
         ends: Any = {"least_noise": floor, "max_iter": limits.error_steps, "tol": TOL}
@@ -323,15 +320,18 @@ def depth_certainty(
         return state, rotations, state.depths(terms.alpha), terms.value / len(tracks)
 
     every = np.ones(len(points), dtype=bool)
-    whole, rotations, depths, value = refit(every, extents=extents)
+    whole, rotations, depths, value = refit(every, extent_weight=extents)
     problem = JointProblem(JointFrames.of_rows(tracks, w), settings)
     deformation = joint.rivals + problem.reversal_error(whole, depths)
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
         deep_states = (stretched(state, camera, FAR)[0] for state in (whole, still))
-        starts, free = (whole, *deep_states), image_penalty(whole)
-        value, *minima = (refit(every, start, of_images=free)[-1] for start in starts)
+        free: dict[str, Any] = {}
+        if widths is not None:  # a prior of images, in place of that of points
+            free = {"precisions": None, "penalty": image_penalty(whole)}
+        starts = whole, *deep_states
+        value, *minima = (refit(every, start, **free)[-1] for start in starts)
         rise = min(minima) - value
         deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
     else:

@@ -105,8 +105,7 @@ def determined(
     state = state._replace(shapes=problem.frames.centred(state.shapes))
     # Orthogonal basis shapes
     basis = state.shapes[1:]
-    products = np.tensordot(basis, basis, axes=([1, 2], [1, 2]))
-    energy, axes = np.linalg.eigh(products)
+    energy, axes = np.linalg.eigh(np.tensordot(basis, basis, axes=([1, 2], [1, 2])))
     energy, axes = np.maximum(energy[::-1], 0.0), axes[:, ::-1]
     basis = np.tensordot(axes.T, basis, 1)
     state = state._replace(shapes=np.concatenate([state.shapes[:1], basis]))
@@ -116,8 +115,7 @@ def determined(
         variances = widths.variances[: len(energy)]
     # Posterior covariance of each point: half the Hessian is curvature / s2.
     ones = np.ones(len(energy))
-    every = Widths(variances, ones, ones, n_numbers)
-    part = replace(problem, widths=every)
+    part = replace(problem, widths=Widths(variances, ones, ones, n_numbers))
     curvature = part.likelihood(*state).shape_curvature
     covariance = state.noise * np.linalg.inv(regular(curvature))
     # If all weights are one, one matrix is valid for all points.
