@@ -279,26 +279,24 @@ def mean_view(motion: NDArray) -> NDArray | None:
     return mean if smaller > 0.2 * root_mean_square else None
 
 
-def distances(
-    rows: NDArray, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
-) -> NDArray:
-    """Return distances (n, J) of points (n, 2, J) from a model, NaN if missing."""
-    return linalg.lengths(residuals(rows, shapes, motion, alpha) - position[..., None])
+def distances(rows: NDArray, *fit: NDArray) -> NDArray:
+    """Return distances (n, J) of points (n, 2, J) from a fit, NaN if missing."""
+    return linalg.lengths(residuals(rows, *fit))
 
 
 def residuals(
-    rows: NDArray, shapes: NDArray, motion: NDArray, alpha: NDArray
+    rows: NDArray, shapes: NDArray, motion: NDArray, position: NDArray, alpha: NDArray
 ) -> NDArray:
-    """Return points (n, 2, J) minus their images at position zero."""
+    """Return points (n, 2, J) minus their images."""
     model = stacked_motion(motion, alpha) @ shapes.reshape(-1, shapes.shape[2])
-    return rows - model.reshape(rows.shape)
+    return rows - model.reshape(rows.shape) - position[..., None]
 
 
 def centred_residuals(
-    rows: NDArray, weights: NDArray, *model: NDArray
-) -> NDArray[np.float64]:
-    """Return `residuals` less their weighted mean; weights (n, J), zero if missing."""
-    residual = residuals(rows, *model)
+    rows: NDArray, weights: NDArray, shapes: NDArray, motion: NDArray, alpha: NDArray
+) -> NDArray:
+    """Return `residuals` of weighted mean zero; weights (n, J), zero if missing."""
+    residual = residuals(rows, shapes, motion, np.zeros((1, 2)), alpha)
     total = weights.sum(axis=1)[:, None]  # zero where no point counts
     position = np.einsum("ij,icj->ic", weights, np.nan_to_num(residual))
     residual -= (position / np.where(total > 0, total, 1.0))[..., None]

@@ -367,8 +367,8 @@ def hidden_residuals(model: FrameModel, rows: NDArray) -> NDArray:
     for first in range(5):
         hidden = np.arange(rows.shape[2]) % 5 == first
         fit = model.posterior_without(rows, hidden)
-        residual = camera_models.residuals(rows, model.shapes, fit.motion, fit.alpha)
-        errors[:, :, hidden] = (residual - fit.translation[:, :, None])[:, :, hidden]
+        residual = camera_models.residuals(rows, model.shapes, *fit[:3])
+        errors[:, :, hidden] = residual[:, :, hidden]
     return errors
 
 

@@ -638,7 +638,7 @@ def left_out_distances(model: FrameModel, rows: NDArray) -> NDArray:
     """
     fit, w = model.without_starts.posterior(rows, False), seen_points(rows) * 1.0
     state = JointState(model.shapes, fit.motion, model.noise_variance)
-    residual = residuals(rows, *state[:2], fit.alpha) - fit.translation[:, :, None]
+    residual = residuals(rows, model.shapes, *fit[:3])
     distance = np.full(w.shape, np.nan)
     for part, A, weighed, inverse in own_unknowns(state, fit.alpha, w, model.camera):
         Z, Y = (x.reshape(len(x), -1, 2, w.shape[1]) for x in (inverse @ A, weighed))
