@@ -16,14 +16,16 @@ from scipy.spatial.transform import Rotation
 from benchmarks.depth import bird, depth_error, seen, sheet
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import CAMERAS
-from isa_nrsfm._frames.models import LARGEST_SHARE
-from isa_nrsfm._joint.fit import GROUPS, _first_fit
+from isa_nrsfm._frames.models import LARGEST_SHARE, FrameMap, FrameModel, spread_starts
+from isa_nrsfm._joint.fit import GROUPS, _first_fit, other_fits, steadiest
 from isa_nrsfm._joint.likelihood import JointFrames, MarginalLikelihood
 from isa_nrsfm._joint.problem import FactorisedTable, JointProblem, JointState, Widths
 from isa_nrsfm._joint.settings import LIMITS, FitSettings
 from isa_nrsfm._joint.starts import (
+    affine_start,
     best_starts,
     both_sides,
+    extended_shapes,
     flat_cameras,
     lifted_shapes,
     likely_basis,
@@ -33,10 +35,12 @@ from isa_nrsfm._joint.starts import (
     unfolded,
 )
 from isa_nrsfm._joint.whole import (
+    FAR_FRAMES,
     determined,
     evidence,
     extended,
     n_directions,
+    rival_depths,
     whole_distribution,
 )
 from isa_nrsfm._linalg import centred
@@ -114,6 +118,13 @@ def test_lifted_shapes_are_principal_directions(camera, n_frames):
     assert_array_equal(shapes[n_frames + 1 :], 0.0)
 
 
+def test_shapes_that_fit_are_extended_by_nothing():
+    scene = random_model(0, 40, 30, 2)
+    parts = scene.centred.mT, scene.shapes, scene.motion, scene.alpha
+    expected = np.pad(scene.shapes, ((0, 2), (0, 0), (0, 0)))
+    assert_allclose(extended_shapes(*parts, 2), expected, atol=1e-9)
+
+
 def problem_of(scene, thorough=True):
     rows = FrameBlocks.of_array(scene.rows, 64)
     frames = JointFrames.from_points(rows, True)
@@ -155,6 +166,47 @@ def test_best_starts_have_nearly_the_true_cameras(thorough, n_starts, largest, o
     assert camera_error(states[0].motion, scene.motion) < largest
 
 
+def test_affine_starts_are_least_squares_fits_with_coefficients_of_size_one():
+    scene = random_scene(noise=0.05)
+    shapes, motion, noise = affine_start(
+        problem_of(scene), scene.W, paper_shapes(scene.factors)
+    )
+    residual = scene.rows - motion @ shapes[0]
+    assert_allclose(residual @ shapes[0].T, 0.0, atol=1e-9)
+    assert noise == pytest.approx(0.1 * np.mean(residual**2))
+    images = np.einsum("irc,kcj->ikrj", motion, shapes[1:])
+    along = np.einsum("ikrj,irj->ik", images, scene.rows)
+    alpha = along / np.sum(images**2, axis=(2, 3))
+    assert_allclose(alpha.std(axis=0), 1.0)
+
+
+def table_of(scene, **settings):
+    """Return the rows of a complete table, its problem, and it, without factors."""
+    rows = scene.centred.mT
+    frames = JointFrames.from_points(FrameBlocks.of_array(rows, 64), True)
+    W = rows.reshape(-1, rows.shape[2])
+    table = FactorisedTable(None, frames, *[None] * 3, W, [], None)
+    return rows, JointProblem(frames, FitSettings(**settings)), table
+
+
+def test_frames_at_a_wrong_minimum_start_from_other_coefficients():
+    """Otherwise shapes that are fitted to larger samples would follow them."""
+    camera = "weak_perspective"
+    scene = random_model(0, 120, 12, 2, deformation=1.0, noise=0.02, camera=camera)
+    rows, problem, _ = table_of(scene, camera=camera)
+    state, n_wrong = JointState(scene.shapes, scene.motion, 0.02**2), []
+    for starts in (np.empty((0, 2)), spread_starts(scene.alpha)):
+        found = problem.aligned(state, starts)
+        assert_calibrated(found.motion, camera)
+        kind = starts, "linear", FrameMap.identity(2), camera
+        model = FrameModel(state.shapes, state.noise, *kind)
+        assert_allclose(model.posterior(rows).motion, found.motion, atol=1e-9)
+        error = np.abs(found.motion - scene.motion).max(axis=(1, 2))
+        n_wrong.append(np.count_nonzero(error > 0.1))
+    assert n_wrong[0] > n_wrong[1] == 0
+    assert problem.likelihood(*found).value < problem.likelihood(*state).value
+
+
 @pytest.mark.parametrize("penalty", [0.0, 0.5, 300.0])
 def test_no_other_basis_is_likelier(penalty):
     scene = random_model(0, 40, 30, 2)
@@ -188,6 +240,50 @@ def test_the_likeliest_fit_of_the_starts_counts():
     fit, _ = _first_fit(problem, table, paper_shapes(factors))
     assert max(ends) > min(ends)
     assert fit.history[-1] == min(ends)
+
+
+@pytest.mark.parametrize(("deformation", "n_found"), [(0.3, 2), (1.0, 0)])
+def test_fits_from_other_starts_count_by_their_evidence(deformation, n_found):
+    """Each has ``exp(-(e - e_0) / 2)``, the evidence e_0 that of the joint fit."""
+    options = {"noise": 0.3, "camera": "orthographic", "deformation": deformation}
+    scene = random_model(2, 40, 16, 3, **options)
+    limits = LIMITS._replace(few_frames=0, widths=())  # one start each
+    _, problem, table = table_of(scene, camera="orthographic", tol=0.01, limits=limits)
+    factors = factorise(table.W, 3)
+    paper = np.concatenate([factors.rigid_shape, factors.signals]).reshape(4, 3, 16)
+    state = JointState(scene.shapes, scene.motion, 0.1)
+    joint = problem.refined(state, max_iter=20)
+    table = table._replace(factors=factors)
+    found = other_fits(table, paper, problem.settings, joint)
+    assert len(found) == n_found
+    n = n_directions(problem, 16, few=True)
+    least = evidence(problem, extended(problem, joint, n))
+    for weight, state in found:
+        above = evidence(problem, joint._replace(state=state)) - least
+        assert weight == pytest.approx(np.exp(-above / 2), rel=1e-6)
+
+
+@pytest.mark.parametrize("depth", [0.05, 1.0])
+def test_the_steadiest_fit_is_more_evident_than_its_start(depth):
+    """Six frames are reversed at first, and an object may be nearly flat."""
+    options = {"camera": "orthographic", "noise": 0.05, "extent": (1.0, 1.0, depth)}
+    scene = random_model(0, 24, 9, 1, deformation=0.4, **options)
+    rows, problem, table = table_of(scene, camera="orthographic", tol=0.1)
+    mirror = np.array([1.0, 1.0, -1.0])
+    motion = np.where(np.arange(24)[:, None, None] < 6, mirror, 1.0) * scene.motion
+    start = JointState(lifted_shapes(rows, motion, 2), motion, 0.1)
+    first = extended(problem, problem.refined(start, max_iter=20), 4)
+    best = steadiest(problem, table, first)
+    fit, widths = whole_distribution(problem, first)
+    fit = fit._replace(widths=widths)
+    assert evidence(problem, best) < evidence(problem, fit) - 0.5
+    # Other depths count by their evidence, mirror images not at all.
+    shapes, motion, noise = best.state
+    state = JointState(shapes * mirror[:, None], motion * mirror, noise)
+    for other, some in ((fit, True), (best._replace(state=state), False)):
+        found = [rival_depths(problem, [(0.0, best), (e, other)]) for e in (0.0, 0.2)]
+        assert_allclose(found[1], np.exp(-0.2 * FAR_FRAMES) * found[0], atol=1e-9)
+        assert (found[0] > 1e-3) == some
 
 
 NOISE, FEW_POINTS = 0.05, 12
