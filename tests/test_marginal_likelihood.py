@@ -8,6 +8,8 @@ from numpy.testing import assert_allclose
 from scenes import likelihood_of, shape_prior
 from scipy.linalg import block_diag
 
+from isa_nrsfm._joint.likelihood import EXTENT_WEIGHT
+
 NOISE = 0.05
 PENALTY = 7.0
 
@@ -191,3 +193,17 @@ def test_values_of_degenerate_scenes_are_finite(scene, part):
     DEGENERATE[part](scene)
     for each in scene.at(PENALTY):
         assert np.isfinite(each).all()
+
+
+@pytest.mark.parametrize("n_seen", [0, 1])
+def test_points_count_for_the_extents_if_a_frame_shows_them(n_seen):
+    scene = random_scene("missing")
+    scene.tracks[:, 5], scene.tracks[:n_seen, 5] = np.nan, 0.0
+    scene.weights[:, 5], scene.weights[:n_seen, 5] = 0.0, 0.5
+    likelihood, rises = likelihood_of(scene.tracks, scene.weights, 0.0), []
+    moved = scene.shapes + 10.0 * (np.arange(9) == 5)
+    for weight in (0.0, EXTENT_WEIGHT):
+        objective = likelihood._replace(extent_weight=weight)
+        pair = (objective(x, scene.motion, NOISE).value for x in (scene.shapes, moved))
+        rises.append(np.subtract(*pair))
+    assert (rises[0] != rises[1]) == bool(n_seen)
