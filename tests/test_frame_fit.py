@@ -22,6 +22,7 @@ from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.uncertainty import (
     N_GROUPS,
     depth_certainty,
+    differences,
     neighbours,
     shape_information,
 )
@@ -238,6 +239,21 @@ def turned():
     X, points, rotations = faces_turned_by(20)
     model = AffineNRSfM(3, camera="weak_perspective", random_state=0)
     return X, points, rotations, model.fit(X)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_differences_of_fits_are_those_in_the_axes_of_the_cameras(side, rng):
+    """The object may be turned, and be mirrored in depth."""
+    whole, common = Rotation.random(200, rng), Rotation.random(rng=rng)
+    w = rng.normal(size=(200, 3)) * [1e-3, 2e-3, 3e-3]
+    mirror, z = np.diag([1.0, 1.0, side]), centred(rng.normal(size=(200, 8)))
+    rotations = mirror @ (Rotation.from_rotvec(w) * whole * common).as_matrix() @ mirror
+    found = differences(rotations, 1.1 * side * z, whole.as_matrix(), z)
+    assert_allclose(found[0], 0.01)
+    products = w.T @ w / 200
+    products[2, :2] = products[:2, 2] = 0.0  # those of mirror images have other signs
+    assert_allclose(found[1], products, atol=1e-7)
+    assert_allclose(found[2], 0.01 * np.mean(z**2, axis=0))
 
 
 class TestExtents:
