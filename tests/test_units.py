@@ -200,6 +200,18 @@ def public_methods():
     }
 
 
+@start_may_not_converge
+@pytest.mark.parametrize("refinement", ["joint", None])
+def test_orthographic_shapes_have_the_size_of_their_images(refinement):
+    settings = {"camera": "orthographic", "refinement": refinement}
+    model, X = fitted(**settings), table("orthographic")
+    M, (_, translation, alpha, *_) = model.motion_, model.decompose(X)
+    assert_allclose(M @ M.mT, np.tile(np.eye(2), (len(X), 1, 1)), atol=1e-9)
+    images = X.reshape(len(X), -1, 2) - translation[:, None]
+    residual = images - model.shapes(alpha) @ M.mT
+    assert np.linalg.norm(residual) < 0.1 * np.linalg.norm(images)
+
+
 def test_orthographic_cameras_do_not_scale_frames():
     # So that one column of the page is enough.
     settings = {"camera": "orthographic", "refinement": "joint"}
