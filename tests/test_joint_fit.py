@@ -263,3 +263,6 @@ class TestDegenerate:
         tracks, truth = random_table(camera, deviation=deviation, **options)
         model = fitted(tracks, 2, camera=camera)
         assert error_of(model, tracks, truth) < max(3 * deviation, 1e-4)
+        # Also of frames that look different, which start again
+        other = random_table(camera, seed=1, n_frames=5, n_points=25)[0]
+        assert model.transform(table_of(other)).shape == (5, 2)

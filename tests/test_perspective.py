@@ -106,7 +106,8 @@ def test_frames(noisy, tmp_path):
     ray = np.vecdot(model.positions_, T) / distance / true
     assert ray.min() > 1.0 - 1e-5
     assert model.score(X) > -3e-4
-    std = model.reconstruct(X, return_std=True)[1]
+    shapes, std = model.reconstruct(X, return_std=True)
+    assert_allclose(shapes, model.reconstruct(X), atol=1e-3 * np.abs(shapes).max())
     assert 0.0 < std.min() < std.max() < 0.5
     assert model.diagnostics(X).outlier_share == 0.0
     deviations = np.sqrt(np.trace(model.rotation_covariance(X), axis1=1, axis2=2))
@@ -284,6 +285,7 @@ def test_axes_of_the_camera(far):
         for kind in (plain, model)
     )
     assert ours < 0.3 * by_ray > 3.0
+    assert (model.focal_length_, model.focal_length_std_) == (F, 0.0)
     # Positions, up to the unit
     ratio = model.positions_ / far.T
     assert_allclose(ratio, ratio[0, 2], rtol=0.1)
