@@ -3,6 +3,7 @@
 import pickle
 import re
 import warnings
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -18,7 +19,7 @@ from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AutoNRSfM
 from isa_nrsfm._prepare.coordinates import still_points  # noqa: F401
-from isa_nrsfm._selection import FIRST, first_settings  # noqa: F401  in refusals.txt
+from isa_nrsfm._selection import FIRST, PROPOSALS, first_settings  # noqa: F401
 from isa_nrsfm.analysis._advice import COMPARE
 from isa_nrsfm.analysis._frame_columns import runs_between_gaps  # noqa: F401
 from isa_nrsfm.datasets import (
@@ -162,6 +163,26 @@ def test_perspective_needs_the_size_of_images():
     assert (found["perspective"].result, model.camera) == ("used", "perspective")
     found, model = tried(faces.data)
     assert found["perspective"].result == "image size not known"
+
+
+def proposed(words, model, rows=None):
+    """Return what a proposal, in its words, makes of a fit."""
+    (proposal,) = (each for _, name, each in PROPOSALS if name == words)
+    return proposal(SimpleNamespace(model=model), rows)
+
+
+def test_perspective_is_tried_with_a_longer_lens_than_most():
+    """The focal length of a rough fit is 2.5 times the longer side of the images."""
+    model = AffineNRSfM(3, refinement="consensus")
+    model.basis_, point = np.ones((3, 9, 3)), np.array([640, 360])
+
+    def rough(params):
+        sees = AffineNRSfM(**params).focal_length == 2.5 * 1280
+        return SimpleNamespace(camera_="perspective" if sees else "weak_perspective")
+
+    rows = SimpleNamespace(principal_point=point, rough=rough)
+    expected = {"camera": "perspective", "principal_point": (640.0, 360.0)}
+    assert proposed("perspective", model, rows) == expected
 
 
 def test_given_settings_are_kept():
