@@ -196,6 +196,23 @@ def test_a_table_of_noise_is_told():
     assert search.best_score_ < -1
 
 
+def test_only_the_chosen_number_has_a_consensus():
+    def scorer(estimator, X, y=None):
+        raise ValueError(estimator.refinement)
+
+    estimator = quick(refinement="consensus", camera="weak_perspective")
+    search = AffineNRSfMCV((1,), estimator=estimator, cv=2, scoring=scorer)
+    refused("joint", search.fit, X[:40, :24])
+
+
+def test_rows_without_points_are_told_once():
+    table = X[:40, :24].copy()
+    table[3] = np.nan
+    with pytest.warns(match="no point is visible in 1 of 40 rows") as told:
+        AffineNRSfMCV((1,), estimator=quick(), cv=2).fit(table)
+    assert len(told) == 1
+
+
 def test_fits_that_do_not_converge_are_counted():
     search = AffineNRSfMCV((1, 2), estimator=quick(max_iter=2))
     with pytest.warns(ConvergenceWarning) as told:
