@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from sklearn import config_context
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm._selection import StartedNRSfM
 from isa_nrsfm.export import frame_points, frame_poses
 from isa_nrsfm.io import load_model, save_model
 
@@ -181,6 +182,13 @@ def test_focal_length_is_estimated_where_points_are_missing(noisy):
     assert frame_error(model.reconstruct(holes), noisy.S) < 0.012
     assert np.isfinite(model.reproject(holes)).all()
     assert_array_equal(model.transform(holes), model.alpha_)
+
+
+def test_a_fit_that_continues_another_has_its_focal_length(noisy):
+    params = noisy.model.get_params(deep=False)
+    model = StartedNRSfM(**params | {"focal_length": None})
+    model._continued = {"start": noisy.model._model}
+    assert_allclose(model.fit(noisy.X).focal_length_, F)
 
 
 @pytest.mark.parametrize(
