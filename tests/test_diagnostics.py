@@ -291,6 +291,8 @@ class TestOutliers:
         images = frames.images(shapes, left.motion, left.translation)
         distance = np.linalg.norm(rows.mT - images, axis=2)[:, 9]
         assert_allclose(sizes[:, 0, 0] * found[:, 9], distance, rtol=0.05)
+        few = np.where(np.arange(rows.shape[2]) % 12, np.nan, rows / sizes)
+        assert np.isnan(left_out_distances(frames.frames, few)).all()  # six points
 
 
 def described(share):

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from layers import QUICK_LIMITS, may_not_converge, slow_after, with_limits
+from layers import QUICK_LIMITS, Quick, may_not_converge, slow_after, with_limits
 from made_once import made_once
 from numpy.testing import assert_allclose
 from scenes import random_scene, table_of, with_gaps, with_outliers
@@ -149,6 +149,13 @@ class TestNoiseVariance:
         model = fitted(tracks, n_components, loss=loss, scale_frames=False)
         assert abs(model.noise_variance_ / DEVIATION**2 - 1) < largest
 
+    def test_of_images_is_that_of_residuals_for_each_free_number(self):
+        tracks, _ = random_table("affine", n_frames=12, n_points=30, n_components=4)
+        frames = fitted(tracks, 4)._model.frames
+        free = 720 - (8 + 4) * 12 - 3 * 5 * 29
+        found = frames.noise_variance * frames.certainty.images[0]
+        assert_allclose(found, 360 * frames.certainty.residual / free, rtol=0.15)
+
     @EACH
     def test_of_tables_with_few_numbers_stays_finite(self, camera):
         # Nearly as many unknowns as numbers: at least a tenth of these counts as free.
@@ -181,6 +188,12 @@ class TestLargeTables:
         X, points, _ = seen(make_body_tracks(1200, random_state=0).shapes, 40, 0)
         model = kind(9, camera="weak_perspective", random_state=0).fit(X)
         assert depth_error(model, X, points)[1] < 0.11
+
+    def test_robust_losses_weigh_all_frames(self):
+        tracks, _ = random_table(n_frames=100, n_points=14, n_components=1)
+        models = [fitted(tracks, 1, k, loss="cauchy") for k in (SampledNRSfM, Quick)]
+        assert_allclose(*(m.noise_variance_ for m in models), rtol=0.02)
+        assert_allclose(*(m.mean_shape_ for m in models), rtol=0, atol=0.02)
 
     def test_points_that_the_sample_does_not_show(self):
         tracks, _ = random_table(n_frames=200)
