@@ -3,6 +3,7 @@
 import copy
 import pickle
 import warnings
+from dataclasses import replace
 from itertools import product
 from types import SimpleNamespace
 
@@ -22,7 +23,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, AutoNRSfM
-from isa_nrsfm._fitted_model import hold_open, prior_start
+from isa_nrsfm._fitted_model import far_points, hold_open, prior_start
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._joint.fit import widened
 from isa_nrsfm._joint.likelihood import JointFrames
@@ -499,6 +500,24 @@ def test_foreign_tables_are_warned_of_once(turned, params, other):
         assert told.startswith("eld-out points of some rows")
         names = {"AutoNRSfM": AutoNRSfM, "model": model, "X": X}
         assert eval(code, names).best_estimator_.prior_std_[0] > 0.01
+
+
+def test_distances_that_noise_and_errors_of_shapes_cause_are_no_misfit(turned):
+    rng, model = np.random.default_rng(0), turned.model._model
+    certainty = model.frames.certainty._replace(images=(1.2, 0.3))
+    frames = replace(model.frames, certainty=certainty)
+    c = np.insert(rng.normal(size=(10_000, len(frames.shapes) - 1)), 0, 1, axis=1)
+    variance = (1.2 + 0.3 * np.mean(np.sum(c**2, axis=1))) * frames.noise_variance
+    distance = np.linalg.norm(rng.normal(0, np.sqrt(variance), (2, 10_000)), axis=0)
+    assert_allclose(model._replace(frames=frames).misfit(distance), 1, rtol=0.03)
+
+
+def test_a_few_frames_do_not_make_points_others():
+    distance, frames = np.full((9, 5), 0.1), SimpleNamespace(loss="linear")
+    frames.noise_variance, distance[:3, 0], distance[3] = 0.0, np.nan, np.nan
+    distance[:2] = 9.0
+    assert far_points(distance, frames) == 0
+    assert_allclose(far_points(3 * distance, frames), 0.3)
 
 
 def test_a_table_that_is_held_is_opened_once(turned):
