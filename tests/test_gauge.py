@@ -130,6 +130,13 @@ class TestConditions:
         energy = np.sum((result.alpha[..., None, None] * moved) ** 2, axis=(0, 2, 3))
         assert (np.diff(energy) <= 0).all()
 
+    def test_hold_if_a_basis_shape_moves_points_along_a_line(self):
+        fit = random_fit()
+        fit.shapes[1, 1:] = 0
+        result, _ = canonical(fit)
+        along = np.tensordot(result.shapes[1:], result.shapes[0])
+        assert_allclose(along, 0, atol=1e-8)
+
     def test_shapes_recovers_independent_basis_shapes(self):
         fit = random_fit(n_points=400)
         result, _ = canonical(regauged(fit), "shapes")

@@ -180,6 +180,13 @@ class TestMethods:
         unkept = clone(model).set_params(keep_frames=False)
         assert_array_equal(unkept.fit_transform(X, point_weight=weights), alpha)
 
+    def test_cameras_depend_on_ratios_of_tiny_weights(self):
+        few, tiny = (
+            fitted().decompose(noisy().X, point_weight=scale * noisy().weights).motion
+            for scale in (1e-6, 1e-10)
+        )
+        assert_allclose(tiny, few, atol=1e-3 * np.abs(few).max())
+
     def test_score_counts_points_by_weight(self, rng):
         model, (X, weights, _) = fitted(), noisy()
         # 1e-4 of the noise plus that of the predictions; 0.04 without weights
