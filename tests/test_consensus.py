@@ -237,7 +237,7 @@ class TestGroupFit:
         frames, found, _ = group_fit(scene, 2, SETTINGS)
         assert_array_equal(frames, np.arange(5, 60))
         assert found.shape == (55, 3, 12)
-        scene.rows[2:, :, 3:] = np.nan
+        scene.rows[7:, :, 3:] = np.nan
         assert group_fit(scene, 2, SETTINGS) is None
 
 
@@ -466,6 +466,13 @@ class TestEstimator:
         table = with_gaps(X, 0.2, 1)
         hidden = error_of(consensus_fit(table), table, SHAPES)
         assert hidden < 2 * error_of(body, X, SHAPES)
+
+    def test_depths_have_the_share_of_the_joint_fit(self, monkeypatch):
+        monkeypatch.setattr("isa_nrsfm._joint.consensus.share_of_first", lambda *_: 1)
+        kinds = ("joint", "consensus")
+        models = (consensus_fit(X[:20], 2, Quick, tol=1.0, refinement=k) for k in kinds)
+        joint, found = (in_camera(model, X[:20])[:, :, 2] for model in models)
+        assert np.std(found - joint) < 0.15 * np.std(joint)  # groups alone: 2
 
     @pytest.mark.parametrize("noise", [0.0, 0.02])
     def test_a_sufficient_joint_fit_is_kept(self, noise):
