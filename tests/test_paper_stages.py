@@ -187,8 +187,9 @@ def test_representative_frames_are_spread_and_show_rare_points():
     rows[order, 0] = np.linspace(0.1, 2.0, 300)[:, None]
     blocks = FrameBlocks.of_array(rows, 64)
     assert_array_equal(representative_frames(blocks, 300), np.arange(300))
-    found = representative_frames(blocks, 50)
-    assert_array_equal(found, np.sort(spread(order, 50)))
+    for unit in (1.0, 2.0**-20):
+        found = representative_frames(FrameBlocks.of_array(unit * rows, 64), 50)
+        assert_array_equal(found, np.sort(spread(order, 50)))
     rows[:, :, 1:3] = np.nan
     rows[order[::7], :, 1] = 1.0  # in 43 frames, and in 5 of those that are spread
     rows[order[3:6], :, 2] = 1.0  # in three frames
