@@ -14,6 +14,7 @@ from scenes import table_of, with_gaps
 from sklearn import config_context
 
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm._tables import open_table as opened
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import open_table
 
@@ -277,6 +278,13 @@ def arrays(folder, **tables):
     for name, values in tables.items():
         np.save(folder / f"{name}.npy", values)
     return folder
+
+
+def test_blocks_need_eight_times_their_own_memory(tmp_path):
+    X = stored(table(), tmp_path)
+    rows = in_blocks(partial(opened, layout="interleaved"), X, 0.05)
+    largest = max(len(range(150)[part]) for part in rows.slices)
+    assert largest == 0.05 * 2**20 // (8 * X[0].nbytes)
 
 
 test_refusals = refusals_of("stored_tables", globals())
