@@ -281,6 +281,15 @@ class TestDegenerate:
             assert_allclose(norms[n_moving:], 0, atol=1e-9)
 
     @EACH
+    def test_deformation_that_has_vanished(self, independence):
+        fit = random_fit()
+        sizes = np.array([[1e-147, 0.0, 1e-167]])
+        shapes = np.append(fit.shapes[:1], fit.shapes[1:] * sizes.T[..., None], axis=0)
+        fit = fit._replace(shapes=shapes, alpha=fit.alpha * sizes)
+        result, _ = canonical(fit, independence)
+        assert_allclose(result.images(), fit.images(), atol=1e-9)
+
+    @EACH
     @pytest.mark.parametrize(("flat", "unit"), [(1, 1e-9), (1, 1.0), (2, 1e9)])
     def test_flat_objects(self, independence, flat, unit):
         fit = random_fit()

@@ -252,7 +252,8 @@ def _mean_shift(alpha: NDArray) -> NDArray:
 def _principal_axes(basis: NDArray, alpha: NDArray) -> NDArray:
     """Return the mixing (K, K) to uncorrelated coefficients and orthogonal shapes."""
     variance, axes = np.linalg.eigh(alpha.T @ alpha / len(alpha))
-    variance[variance <= OF_RANKS**2 * max(variance[-1], 1e-300)] = 1.0
+    # Constant ones are as large as the others: any other size may be beyond rounding.
+    variance[variance <= OF_RANKS**2 * variance[-1]] = max(variance[-1], 0.0) or 1.0
     root = (axes * np.sqrt(variance)) @ axes.T
     flat = root @ basis.reshape(len(basis), -1)
     directions: NDArray = np.linalg.eigh(flat @ flat.T)[1]
