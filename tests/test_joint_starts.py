@@ -257,7 +257,7 @@ def test_fits_from_other_starts_count_by_their_evidence(deformation, n_found):
     found = other_fits(table, paper, problem.settings, joint)
     assert len(found) == n_found
     n = n_directions(problem, 16, few=True)
-    least = evidence(problem, extended(problem, joint, n))
+    least = evidence(problem, extended(problem, joint.state, n))
     for weight, state in found:
         above = evidence(problem, joint._replace(state=state)) - least
         assert weight == pytest.approx(np.exp(-above / 2), rel=1e-6)
@@ -272,10 +272,11 @@ def test_the_steadiest_fit_is_more_evident_than_its_start(depth):
     mirror = np.array([1.0, 1.0, -1.0])
     motion = np.where(np.arange(24)[:, None, None] < 6, mirror, 1.0) * scene.motion
     start = JointState(lifted_shapes(rows, motion, 2), motion, 0.1)
-    first = extended(problem, problem.refined(start, max_iter=20), 4)
-    best = steadiest(problem, table, first)
-    fit, widths = whole_distribution(problem, first)
-    fit = fit._replace(widths=widths)
+    first = extended(problem, problem.refined(start, max_iter=20).state, 4)
+    best, fit = (
+        steadiest(problem, table, first),
+        whole_distribution(problem, first.state),
+    )
     assert evidence(problem, best) < evidence(problem, fit) - 0.5
     # Other depths count by their evidence, mirror images not at all.
     shapes, motion, noise = best.state
