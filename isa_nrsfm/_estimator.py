@@ -202,8 +202,8 @@ default="affine"
     depth_uncertainty_ : float
         Expected RMS error of the depths of the frames, relative to their RMS
         (calibrated cameras with the joint refinement only). Above 0.4 they are
-        doubtful, above 0.55 depths and angles are withheld. It contains what
-        deformation explains as well as turning.
+        doubtful without a prior, above 0.55 depths and angles are withheld. It contains
+        what deformation explains as well as turning.
     mirror_certainty_ : float
         Probability that the depth has the right sign, if perspective, the prior or
         missing points decide it: a test of whether these are farther away is

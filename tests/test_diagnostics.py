@@ -27,6 +27,7 @@ from isa_nrsfm.analysis._advice import (
     FIT,  # noqa: F401  in refusals.txt
     Facts,
     advice,
+    depth_advice,
     gross_residuals,
     verdict,  # noqa: F401  in refusals.txt
 )
@@ -367,6 +368,11 @@ class TestAdvice:
             bent = "wrong points: they bend the shapes. Correct them"
             assert text.startswith(bent) == (share > 0)
             assert not (share > 0 and "n_components" in text)
+
+    def test_doubts_are_those_of_fits_without_a_prior(self):
+        known = {"certainty": UNKNOWN["doubtful"]}
+        assert "doubtful" in depth_advice(facts(**known))
+        assert not depth_advice(facts(**known, prior=object()))
 
 
 # --- what a notebook shows of a model ------------------------------------------------

@@ -34,8 +34,8 @@ SAME_UNIT = (
 # above which it is poor; errors of depths likewise, of which the second withholds them.
 # Few points and frames: docs/benchmarks/README.md, "Thresholds".
 FIT, DEPTH = (0.02, 0.2), (0.2, LARGEST_SHARE)
-# Error of depths above which every second one was in truth above `LARGEST_SHARE`:
-# docs/depth.md, "Undetermined depth".
+# Error of depths above which every second one was in truth above `LARGEST_SHARE`, of
+# fits without a prior: docs/depth.md, "Undetermined depth".
 DOUBTFUL = 0.4
 FEW_POINTS = 10
 # What to do if other settings may be better; the command line does it by itself.
@@ -189,7 +189,8 @@ def outlier_advice(facts: Facts) -> str:
 def depth_advice(facts: Facts) -> str:
     """Return the message on depths that calibrated cameras hardly determine, or not."""
     certainty = frames_of(facts.model).certainty
-    if facts.model.camera_ == "affine" or not certainty.total > DOUBTFUL:
+    least = DOUBTFUL if facts.model.prior is None else LARGEST_SHARE
+    if facts.model.camera_ == "affine" or not certainty.total > least:
         return ""
     error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
     state, result = "not determined", "Angles and proportions are withheld"
