@@ -141,10 +141,9 @@ def images_of(model, shapes):
 
 def found_by_ours(model, X):
     """Return what AffineNRSfM has found in its table, with all directions of shapes."""
-    frames = model.decompose(X)
     shapes, images = model.reconstruct(X), model.reproject(X)
     if model.camera != "affine":
-        cameras = rotations_and_scales(frames.motion)
+        cameras = rotations_and_scales(model.decompose(X).motion)
         return Found(images, shapes, shapes, *cameras)
     metric = deformation_metric(model.motion_, model.alpha_)
     euclidean = euclidean_frames(

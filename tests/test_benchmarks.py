@@ -166,6 +166,16 @@ def test_stored_results_give_every_page():
         assert page.count("\n| ") > 3
 
 
+def test_runs_of_the_paper_leave_out_what_takes_too_long():
+    runs = _paper.runs(list(_paper.PRINTED), _paper.PAPER.methods, 3)
+    fits = [run[:3] for run in runs if run[3]["part"] == "fit"]
+    dense = {method for name, method, _ in fits if name == "ict_dense"}
+    assert dense == {*_paper.PAPER.methods} - {"pi", "bmm", "kong_lucey"}
+    assert fits.count(("shark", "isa1", 2)) == 1
+    assert ("ict_dense", "isa1", 1) not in fits
+    assert not [fit for fit in fits if fit[1] == "floor" and fit[2]]
+
+
 def test_random_mixing_spoils_blocks_unless_energies_are_equal():
     for even in (np.ones(9), [5.0, 2.0, 1.0]):
         assert _paper.turned_at_random(even) == pytest.approx(0.0, abs=1e-10)

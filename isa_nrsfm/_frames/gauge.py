@@ -391,17 +391,22 @@ def _fixed_point(W: NDArray, Z: NDArray, n_steps: int) -> NDArray:
 def _log_density(u: NDArray, tail: NDArray, size: int) -> NDArray:
     """Return the log density F(u) of `TAILS` at squared norms u (..., n_samples)."""
     light = tail == LIGHT
-    heavy = -0.5 * (tail + size) * np.log1p(u / np.where(light, 1.0, tail))
-    return np.where(light, -0.5 / (size + 2) * u * u, heavy) - 0.5 * TEMPER * u
+    F = -0.5 * (tail + size) * np.log1p(u / np.where(light, 1.0, tail))
+    if light.any():
+        F = np.where(light, -0.5 / (size + 2) * u * u, F)
+    return F - 0.5 * TEMPER * u
 
 
 def _slopes(u: NDArray, tail: NDArray, size: int) -> tuple[NDArray, NDArray]:
     """Return F'(u) and F''(u), for u and `tail` as in `_log_density`."""
     light = tail == LIGHT
     nearness = 1.0 / (np.where(light, 1.0, tail) + u)
-    heavy = -0.5 * (tail + size) * nearness
-    g = np.where(light, -1.0 / (size + 2) * u, heavy)
-    return g - 0.5 * TEMPER, np.where(light, -1.0 / (size + 2), -heavy * nearness)
+    g = -0.5 * (tail + size) * nearness
+    dg = -g * nearness
+    if light.any():
+        g = np.where(light, -1.0 / (size + 2) * u, g)
+        dg = np.where(light, -1.0 / (size + 2), dg)
+    return g - 0.5 * TEMPER, dg
 
 
 @cache

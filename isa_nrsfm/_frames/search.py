@@ -685,8 +685,11 @@ class FrameSearch:
         if not self.model.calibrated:
             return self.evaluate(problem, M)
         starts = calibrated_starts(self.model, M)
-        first, second = (coefficient_posterior(problem, M).value for M in starts)
-        return self.evaluate(problem, np.where(second < first, *starts[::-1]))
+        first, second = (coefficient_posterior(problem, M) for M in starts)
+        lower = second.value < first.value
+        parts = zip(first[1:], second[1:], strict=True)
+        chosen = (np.where(lower, other, each) for each, other in parts)
+        return self._derivatives(CoefficientPosterior(problem, *chosen))[0]
 
     def evaluate(self, problem: FrameProblem, position: NDArray) -> State:
         """Return ``s2 F`` and its derivatives at M (2, 3, n)."""

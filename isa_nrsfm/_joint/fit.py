@@ -656,8 +656,6 @@ def _weighted(
     block: WeightedRows, *fit: NDArray, shapes: NDArray, loss: str, deviation: float
 ) -> WeightedRows:
     """Return frames with the weights of their residuals from a fit."""
-    distance, sizes = (
-        lengths(centred_residuals(*block, shapes, *fit)),
-        robust_sizes(block[0]),
-    )
+    distance = lengths(centred_residuals(*block, shapes, *fit))
+    sizes = robust_sizes(block[0])
     return block[0], frame_weights(loss, distance, deviation, sizes)

@@ -326,6 +326,8 @@ def _joined(parts: Iterable[Terms]) -> Terms:
     for added, terms in parts:
         sums = added if sums is None else tuple(map(add, sums, added))
         by_frame.append(terms)
+    if len(by_frame) == 1:  # no copies
+        return sums, terms
     join = partial(np.concatenate, axis=-1)
     return sums, tuple(map(join, zip(*by_frame, strict=True)))
 

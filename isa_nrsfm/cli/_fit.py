@@ -234,9 +234,9 @@ def _fitted(
     if "n_components" in given:
         given["n_components"] = args.n_components[0]
     params, free = first_settings(given)
+    params["scale_frames"] = not args.no_scale_frames
+    params["hidden_points"] = not args.no_hidden_points
     estimator = AffineNRSfM(isa=isa, remove_pose=args.remove_pose, **params)
-    estimator.scale_frames = not args.no_scale_frames
-    estimator.hidden_points = not args.no_hidden_points
     if estimator.camera == "perspective" or args.focal_length is not None:
         estimator.set_params(principal_point=frames.principal_point)
     choice: dict[str, Any] = {}

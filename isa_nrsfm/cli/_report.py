@@ -458,8 +458,10 @@ def _plain(value: Any) -> Any:
         return {as_utf8(str(key)): _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    if value is None or isinstance(value, int | float):
-        return None if value is None or not math.isfinite(value) else value
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if value is None or isinstance(value, int):
+        return value
     return as_utf8(value if isinstance(value, str) else repr(value))
 
 
@@ -578,11 +580,19 @@ def _perspective(model: dict[str, Any], unit: dict[str, Any] | None) -> list[str
 def _alpha(model: dict[str, Any]) -> Section:
     """Return the distribution of the coefficients, and what the pose predicts."""
     head = ["", "energy", "min", "row", "max", "row", "pose", "again"]
-    cells = "{name}|{energy:.1f} %|{min:z.2f}|{row_of_min}|{max:z.2f}|{row_of_max}"
-    rows = []
-    for row in model["alpha"]:
-        numbers = cells.format(energy=100 * row["energy_share"], **row).split("|")
-        rows.append([*numbers, _pose_share(row), row["stability_word"] or ""])
+    rows = [
+        [
+            row["name"],
+            f"{100 * row['energy_share']:.1f} %",
+            f"{row['min']:z.2f}",
+            f"{row['row_of_min']}",
+            f"{row['max']:z.2f}",
+            f"{row['row_of_max']}",
+            _pose_share(row),
+            row["stability_word"] or "",
+        ]
+        for row in model["alpha"]
+    ]
     columns = [True] * 6 + [any(row[k] for row in rows) for k in (6, 7)]
     table = [[*compress(line, columns)] for line in (head, *rows)]
     notes = [

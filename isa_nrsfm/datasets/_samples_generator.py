@@ -46,9 +46,10 @@ PARAMETERS: dict[str, list[Any]] = {
 FRAMES_A_SECOND = 25.0
 # Pixels of translations of films: their middle, and the largest way from it
 MIDDLE, REACH = np.array([640.0, 480.0]), np.array([320.0, 240.0])
-# Perspective cameras: pixels of the image; nearest and largest relative distance
-IMAGE, NEAREST, FARTHEST = np.array([1280.0, 720.0]), 0.85, 1.15
-FOCAL_LENGTH = 1000.0
+# Perspective cameras: pixels of the image, and of the focal length if it is not given;
+# nearest and largest relative distance
+IMAGE, FOCAL_LENGTH = np.array([1280.0, 720.0]), 1000.0
+NEAREST, FARTHEST = 0.85, 1.15
 
 
 class Recording(NamedTuple):

@@ -505,10 +505,11 @@ def read_wflw(path: Path) -> Landmarks:
     numbers = np.stack([floats_of(row) for row in fields[:, :-1].tolist()])
     frames: dict[str, object] = {"image": fields[:, -1]}
     points, box, attributes = np.split(numbers, [196, 200], axis=1)
-    if not np.isin(attributes, (0, 1)).all():
-        raise ValueError("the six attributes before the image must be 0 or 1")
-    frames |= zip(_DATA["wflw_box"], box.T, strict=False)
-    frames |= zip(_DATA["wflw_attributes"], attributes.T.astype(int), strict=False)
+    if n == 207:
+        if not np.isin(attributes, (0, 1)).all():
+            raise ValueError("the six attributes before the image must be 0 or 1")
+        frames |= zip(_DATA["wflw_box"], box.T, strict=True)
+        frames |= zip(_DATA["wflw_attributes"], attributes.T.astype(int), strict=True)
     return assemble(points.reshape(-1, 98, 2), None, frames, format="wflw")
 
 
