@@ -665,16 +665,18 @@ class FrameSearch:
     def reversals(
         self, problem: FrameProblem, motion: NDArray
     ) -> tuple[NDArray, NDArray, NDArray]:
-        """Return the minima from reversed cameras (n, 2, 3) and alpha (n, K) there.
+        """Return the minima from cameras and from reversed ones: (n, 2, 2, 3).
 
-        The third result (n,) is the rise of -2 log L from the given cameras.
+        The second result (n, 2, K) is alpha there, the third one (n,) the rise of -2
+        log L from the first to the second minimum.
         """
         M = frames_last(motion @ self.space.T)
-        value = coefficient_posterior(problem, M).value
-        M = self.descend(problem, self.evaluate(problem, M * REVERSED), 30)
-        posterior = coefficient_posterior(problem, M)
-        rise = (posterior.value - value) / problem[1]
-        return frames_first(M) @ self.space, posterior.alpha.T, rise
+        starts = (self.evaluate(problem, start) for start in (M, M * REVERSED))
+        ends = [self.descend(problem, start, 30) for start in starts]
+        here, there = (coefficient_posterior(problem, end) for end in ends)
+        motion = np.stack([frames_first(end) @ self.space for end in ends], axis=1)
+        alpha = np.stack([here.alpha.T, there.alpha.T], axis=1)
+        return motion, alpha, (there.value - here.value) / problem[1]
 
     def start(self, problem: FrameProblem, alpha: NDArray) -> State:
         """Return the state at cameras near the affine ones for alpha (K, n).

@@ -285,16 +285,20 @@ class JointProblem:
         motion, better = self._searched(FrameSearch.reversed_cameras, state)
         return state._replace(motion=motion), int(better.sum())
 
-    def reversal_error(self, state: JointState, depths: NDArray) -> float:
-        """Return the mean squared error of depths (I, J) that may be reversed.
+    def reversal_errors(self, state: JointState) -> NDArray:
+        """Return the squared errors (I,) of the depths by reversals of frames.
 
-        Relative to their mean square. Each frame is reversed with the probability ``1 /
-        (1 + exp(r / 2))``, r the rise of -2 log L at the minimum from there.
+        Relative to the mean square of the depths z and those z' at the minimum from the
+        reversed camera: ``2 |z - z'|^2 / (|z|^2 + |z'|^2) / (1 + exp(r / 2))``, r the
+        rise of -2 log L from the minimum at the given camera.
         """
         motion, alpha, rise = self._searched(FrameSearch.reversals, state)
-        other = state._replace(motion=motion).depths(alpha)
-        square = np.sum((other - depths) ** 2, axis=1)
-        return float(expit(-rise / 2) @ square / max(np.sum(depths**2), 1e-300))
+        z, other = (
+            state._replace(motion=motion[:, i]).depths(alpha[:, i]) for i in (0, 1)
+        )
+        total = np.sum(z**2 + other**2, axis=1)
+        square = np.sum((z - other) ** 2, axis=1)
+        return 2 * expit(-rise / 2) * square / np.maximum(total, 1e-300)
 
     def _searched(self, method: Any, state: JointState) -> list[NDArray]:
         """Return the results of a method of the search for all frames."""

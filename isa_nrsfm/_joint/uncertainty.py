@@ -54,7 +54,7 @@ from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointFit, JointProblem, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import camera_moments, other_depths, steadied, stretched
-from isa_nrsfm._joint.whole import FAR_FRAMES
+from isa_nrsfm._joint.whole import FAR_FRAMES, extended, n_directions
 from isa_nrsfm._linalg import OF_DISTANCES, centred, lengths
 from isa_nrsfm._prepare.robust import frame_weights, robust_sizes
 from isa_nrsfm._prepare.scaling import ScaledTable
@@ -321,8 +321,9 @@ def depth_certainty(
 
     every = np.ones(len(points), dtype=bool)
     whole, rotations, depths, value = refit(every, extent_weight=extents)
-    problem = JointProblem(JointFrames.of_rows(tracks, w), settings)
-    deformation = joint.rivals + problem.reversal_error(whole, depths)
+    quiet = settings._replace(on_step=None)
+    problem = JointProblem(JointFrames.of_rows(tracks, w), quiet)
+    deformation = joint.rivals + reversal_error(problem, whole, depths)
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
@@ -354,6 +355,29 @@ def depth_certainty(
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
     total = float(np.sqrt(factor * total + deformation))
     return DepthCertainty(total, deformation, factor * turns, variances[nearest])
+
+
+def reversal_error(problem: JointProblem, state: JointState, depths: NDArray) -> float:
+    """Return the mean squared error of depths (I, J) by frames that may be reversed.
+
+    Relative to their mean square. Shapes keep the frames that they fit on their sides,
+    so each fifth of the frames is compared under shapes that fit the others, from the
+    mean shape, or from all shapes with a prior.
+    """
+    shapes, motion, noise = state
+    n_folds = min(N_GROUPS, len(motion))
+    fold = np.random.RandomState(0).permutation(len(motion)) % n_folds
+    known = shapes if problem.settings.shape_prior is not None else shapes[:1]
+    total = 0.0
+    for members in (fold == number for number in range(n_folds)):
+        own, others = np.flatnonzero(members), np.flatnonzero(~members)
+        part = problem.part(others, problem.settings.tol)
+        n = min(len(shapes) - 1, n_directions(part, shapes.shape[2], few=True))
+        fit = extended(part, JointState(known, motion[others], noise), n)
+        part = problem.part(own, problem.settings.tol)
+        errors = part.reversal_errors(fit.state._replace(motion=motion[own]))
+        total += float(errors @ np.sum(depths[own] ** 2, axis=1))
+    return total / max(np.sum(depths**2), 1e-300)
 
 
 def mean_depths(
