@@ -574,8 +574,8 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
     The first fit has weak-perspective cameras. Robust losses are tried if the table has
     outliers, orthographic cameras if all frames have one scale, affine ones if images
     are stretched, and perspective if the size of the images is known. If the depth is
-    not determined, the face prior is tried for layouts of faces (first, if a rough fit
-    shows this), and then the consensus of groups of points, which is also tried for
+    not determined or doubtful, the face prior is tried for layouts of faces (first, if
+    a rough fit does not determine it), and then the consensus of groups of points, which is also tried for
     objects whose parts turn by themselves.
 
     Parameters
@@ -879,7 +879,7 @@ def _face_prior(best: _Fit, rows: _Rows) -> Proposal:
     """The prior of faces supplies depths that a table does not determine."""
     if rows.face_layout not in choices.FACE_PRIORS:
         return "no layout of faces"
-    if best.determined:
+    if advice.known_depth(best.model):
         return "the depth is known"
     if best.model.camera != "weak_perspective":
         return f"not with {best.model.camera} cameras"
@@ -900,7 +900,7 @@ def _consensus(best: _Fit, rows: _Rows) -> Proposal:
     if best.model.camera == "affine" or rows.weights:
         return "not with affine cameras or weights"
     cue = best.model.prior or best.model.camera == "perspective"
-    if best.determined and (cue or rows.own_rotations(best.model) < OWN_ROTATIONS):
+    if advice.known_depth(best.model) and (cue or rows.own_rotations(best.model) < OWN_ROTATIONS):
         return "the depth is known"
     return {"refinement": "consensus"}
 

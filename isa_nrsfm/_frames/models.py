@@ -28,7 +28,7 @@ from isa_nrsfm._tables import point_patterns, seen_points
 
 # Depths are not determined above this error, relative to their root mean square:
 # docs/depth.md, "Undetermined depth".
-LARGEST_SHARE = 0.55
+LARGEST_SHARE = 0.6
 
 
 class DepthCertainty(NamedTuple):

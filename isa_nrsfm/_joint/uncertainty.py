@@ -85,8 +85,9 @@ MOST_FRAMES, MOST_POINTS, MOST_DIRECTIONS = 200, 200, 16
 # Errors were then 30 times the deviation, with this floor 5 times. With a noise of 0.1
 # %, the floor changes no deviation by more than a third.
 LEAST_NOISE = 1e-6
-# Factor of the depths of a fit that hardly turns: docs/depth.md, "How it is estimated".
-FAR = 1000.0
+# Factors of the depths of a fit that turns less, and of one that hardly turns:
+# docs/depth.md, "How it is estimated".
+DEEPER, FAR = 2.0, 1000.0
 
 
 # Result of `fitted_frames`.
@@ -327,14 +328,17 @@ def depth_certainty(
     if prior is None:
         # Some frames may be seen from behind: also from cameras that turn less.
         still = whole._replace(motion=steadied(whole.motion))
-        deep_states = (stretched(state, camera, FAR)[0] for state in (whole, still))
         free: dict[str, Any] = {}
         if widths is not None:  # a prior of images, in place of that of points
             free = {"precisions": None, "penalty": image_penalty(whole)}
-        starts = whole, *deep_states
-        value, *minima = (refit(every, start, **free)[-1] for start in starts)
-        rise = min(minima) - value
-        deformation += float(np.exp(-FAR_FRAMES * max(rise, 0.0)))
+        (*_, found, value), errors = refit(every, whole, **free), []
+        for start, factor in (whole, DEEPER), (whole, FAR), (still, FAR):
+            start, _ = stretched(start, camera, factor)
+            _, _, z, end = refit(every, start, **free)
+            z *= np.copysign(1.0, np.sum(z * found))
+            change = min(np.sum((z - found) ** 2) / np.sum(found**2), 1.0)
+            errors.append(change * np.exp(-FAR_FRAMES * max(end - value, 0.0)))
+        deformation += float(max(errors))
     else:
         costs, stretches = [0.5 * prior.cost], [0.0]
         for start, other, change in other_depths(whole, camera, prior):

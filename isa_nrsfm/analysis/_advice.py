@@ -186,11 +186,16 @@ def outlier_advice(facts: Facts) -> str:
     return f"{facts.outliers}: they bend the shapes. Correct them{facts.compare}"
 
 
+def known_depth(model: Any) -> bool:
+    """Return whether the depths of a joint fit are determined and not doubtful."""
+    most = DOUBTFUL if model.prior is None else LARGEST_SHARE
+    return model.camera_ != "affine" and not frames_of(model).certainty.total > most
+
+
 def depth_advice(facts: Facts) -> str:
     """Return the message on depths that calibrated cameras hardly determine, or not."""
     certainty = frames_of(facts.model).certainty
-    least = DOUBTFUL if facts.model.prior is None else LARGEST_SHARE
-    if facts.model.camera_ == "affine" or not certainty.total > least:
+    if facts.model.camera_ == "affine" or known_depth(facts.model):
         return ""
     error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
     state, result = "not determined", "Angles and proportions are withheld"
