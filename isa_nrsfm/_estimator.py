@@ -202,7 +202,7 @@ default="affine"
     depth_uncertainty_ : float
         Expected RMS error of the depths of the frames, relative to their RMS
         (calibrated cameras with the joint refinement only). Above 0.4 they are
-        doubtful without a prior, above 0.55 depths and angles are withheld. It contains
+        doubtful without a prior, above 0.6 depths and angles are withheld. It contains
         what deformation explains as well as turning.
     mirror_certainty_ : float
         Probability that the depth has the right sign, if perspective, the prior or

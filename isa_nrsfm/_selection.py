@@ -575,8 +575,8 @@ class AutoNRSfM(ChosenMixin, BaseEstimator):
     outliers, orthographic cameras if all frames have one scale, affine ones if images
     are stretched, and perspective if the size of the images is known. If the depth is
     not determined or doubtful, the face prior is tried for layouts of faces (first, if
-    a rough fit does not determine it), and then the consensus of groups of points, which is also tried for
-    objects whose parts turn by themselves.
+    a rough fit does not determine it), and then the consensus of groups of points. This
+    is also tried for objects whose parts turn by themselves.
 
     Parameters
     ----------
@@ -900,8 +900,9 @@ def _consensus(best: _Fit, rows: _Rows) -> Proposal:
     if best.model.camera == "affine" or rows.weights:
         return "not with affine cameras or weights"
     cue = best.model.prior or best.model.camera == "perspective"
-    if advice.known_depth(best.model) and (cue or rows.own_rotations(best.model) < OWN_ROTATIONS):
-        return "the depth is known"
+    if advice.known_depth(best.model):
+        if cue or rows.own_rotations(best.model) < OWN_ROTATIONS:
+            return "the depth is known"
     return {"refinement": "consensus"}
 
 

@@ -18,6 +18,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer
 
 from isa_nrsfm import AffineNRSfM, AutoNRSfM
+from isa_nrsfm._frames.models import DepthCertainty
 from isa_nrsfm._prepare.coordinates import still_points  # noqa: F401
 from isa_nrsfm._selection import FIRST, PROPOSALS, first_settings  # noqa: F401
 from isa_nrsfm.analysis._advice import COMPARE
@@ -183,6 +184,17 @@ def test_perspective_is_tried_with_a_longer_lens_than_most():
     rows = SimpleNamespace(principal_point=point, rough=rough)
     expected = {"camera": "perspective", "principal_point": (640.0, 360.0)}
     assert proposed("perspective", model, rows) == expected
+
+
+@pytest.mark.parametrize(("error", "prior"), [(0.3, None), (0.5, None), (0.5, "any")])
+def test_doubtful_depths_have_groups_tried(error, prior):
+    model = AffineNRSfM(camera="weak_perspective", prior=prior)
+    certainty, model.camera_ = DepthCertainty(total=error), model.camera
+    model._model = SimpleNamespace(frames=SimpleNamespace(certainty=certainty))
+    rows = SimpleNamespace(weights=None, own_rotations=lambda model: 0.0)
+    found = proposed("consensus", model, rows)
+    known = error < 0.4 or prior is not None
+    assert found == ("the depth is known" if known else {"refinement": "consensus"})
 
 
 def test_given_settings_are_kept():

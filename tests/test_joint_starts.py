@@ -550,3 +550,17 @@ def test_beating_wings_are_no_rolling_bird(seed):
     _, error = depth_error(model, X, points)
     stated = model.depth_uncertainty_
     assert stated > LARGEST_SHARE or error < min(3 * stated, 0.3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 2])
+def test_depths_of_balloons_that_hardly_turn_are_unsure(seed):
+    """Depths twice as large, with half of the turning, are nearly as likely."""
+    rng = np.random.default_rng(seed)
+    sphere = rng.normal(size=(25, 3))
+    sphere /= np.linalg.norm(sphere, axis=1)[:, None]
+    X, points, _ = seen(sphere * (1 + 0.25 * rng.normal(size=(100, 1, 3))), 4, seed)
+    with warnings.catch_warnings(action="ignore"):
+        model = AffineNRSfM(3, camera="weak_perspective", random_state=0).fit(X)
+    _, error = depth_error(model, X, points)
+    assert 0.5 * error < model.depth_uncertainty_ < 2 * error

@@ -41,12 +41,12 @@ class DepthCertainty(NamedTuple):
         RMS error of the depths, relative to their RMS. Its square is the sum of that of
         the jackknife and `deformation`.
     deformation : float
-        ``exp(-4 r)``, with the rise r of -2 log L of a frame if depths are a thousand
-        times as large, and cameras hardly turn: near one if deformation explains the
-        images as well as rotations do. Plus the same of other fits with their evidence,
-        times the relative squared difference of their depths. Plus the error of frames
-        that may be reversed in depth. With a prior, the mean
-        square of the relative change of depths that the prior and the table allow.
+        Relative squared error by other explanations of the images: the largest ``d
+        exp(-4 r)`` of depths twice and a thousand times as large, with cameras that
+        turn less. r is the rise of -2 log L of a frame, d <= 1 the squared difference.
+        Plus the same of other fits with their evidence. Plus the error of frames that
+        may be reversed in depth. With a prior, the mean square of the relative change
+        of depths that the prior and the table allow.
     turns : ndarray of shape (3, 3) or None
         Covariance of the rotation vectors, in radians squared, in the camera's axes.
     points : ndarray of shape (n_points,) or None

@@ -102,7 +102,7 @@ class Diagnostics(NamedTuple):
     fit : str
         "good" if `held_out_error` is at most 2 %, "fair" up to 20 %, otherwise "poor".
     depth : str
-        "good" if `depth_uncertainty` is at most 20 %, "fair" up to 55 %, otherwise
+        "good" if `depth_uncertainty` is at most 20 %, "fair" up to 60 %, otherwise
         "poor". Both are empty if they are not known.
     """
 
