@@ -22,7 +22,7 @@ two of these halves differ as much as two independent tables of the full size (M
 "Pseudo-replication: half samples", 1969, with balanced half samples).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -36,6 +36,7 @@ from scipy.special import softmax
 
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
+    CameraModel,
     centred_residuals,
     distances,
     full_rotations,
@@ -326,19 +327,10 @@ def depth_certainty(
     problem = JointProblem(JointFrames.of_rows(tracks, w), quiet)
     deformation = joint.rivals + reversal_error(problem, whole, depths)
     if prior is None:
-        # Some frames may be seen from behind: also from cameras that turn less.
-        still = whole._replace(motion=steadied(whole.motion))
         free: dict[str, Any] = {}
         if widths is not None:  # a prior of images, in place of that of points
             free = {"precisions": None, "penalty": image_penalty(whole)}
-        (*_, found, value), errors = refit(every, whole, **free), []
-        for start, factor in (whole, DEEPER), (whole, FAR), (still, FAR):
-            start, _ = stretched(start, camera, factor)
-            _, _, z, end = refit(every, start, **free)
-            z *= np.copysign(1.0, np.sum(z * found))
-            change = min(np.sum((z - found) ** 2) / np.sum(found**2), 1.0)
-            errors.append(change * np.exp(-FAR_FRAMES * max(end - value, 0.0)))
-        deformation += float(max(errors))
+        deformation += turning_error(partial(refit, every, **free), whole, camera)
     else:
         costs, stretches = [0.5 * prior.cost], [0.0]
         for start, other, change in other_depths(whole, camera, prior):
@@ -359,6 +351,27 @@ def depth_certainty(
     nearest = cdist(frames.shapes[0].T, mean_shape.T).argmin(axis=1)
     total = float(np.sqrt(factor * total + deformation))
     return DepthCertainty(total, deformation, factor * turns, variances[nearest])
+
+
+def turning_error(
+    refit: Callable[[JointState], tuple[Any, Any, NDArray, float]],
+    state: JointState,
+    camera: CameraModel,
+) -> float:
+    """Return the squared error of depths if cameras turn less and shapes are deeper.
+
+    `refit` fits all points from a state, and returns depths and the objective at last.
+    """
+    _, _, found, value = refit(state)
+    # Some frames may be seen from behind: also from cameras that turn less.
+    still = state._replace(motion=steadied(state.motion))
+    errors = []
+    for start, factor in (state, DEEPER), (state, FAR), (still, FAR):
+        _, _, z, end = refit(stretched(start, camera, factor)[0])
+        z *= np.copysign(1.0, np.sum(z * found))
+        change = min(np.sum((z - found) ** 2) / np.sum(found**2), 1.0)
+        errors.append(change * np.exp(-FAR_FRAMES * max(end - value, 0.0)))
+    return float(max(errors))
 
 
 def reversal_error(problem: JointProblem, state: JointState, depths: NDArray) -> float:
