@@ -369,7 +369,8 @@ def turning_error(
     for start, factor in (state, DEEPER), (state, FAR), (still, FAR):
         _, _, z, end = refit(stretched(start, camera, factor)[0])
         z *= np.copysign(1.0, np.sum(z * found))
-        change = min(np.sum((z - found) ** 2) / np.sum(found**2), 1.0)
+        square = max(np.sum(found**2), 1e-300)
+        change = min(np.sum((z - found) ** 2) / square, 1.0)
         errors.append(change * np.exp(-FAR_FRAMES * max(end - value, 0.0)))
     return float(max(errors))
 
