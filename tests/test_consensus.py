@@ -415,6 +415,7 @@ def body():
 class TestEstimator:
     """`AffineNRSfM` with refinement="consensus"."""
 
+    @pytest.mark.filterwarnings("ignore:the depth of the shapes")  # few, rough fits
     def test_frames_of_the_fit_are_those_of_transform(self):
         """`alpha_` and `motion_` are the results of `decompose`.
 
@@ -467,6 +468,7 @@ class TestEstimator:
         hidden = error_of(consensus_fit(table), table, SHAPES)
         assert hidden < 2 * error_of(body, X, SHAPES)
 
+    @pytest.mark.filterwarnings("ignore:the depth of the shapes")  # few, rough fits
     def test_depths_have_the_share_of_the_joint_fit(self, monkeypatch):
         monkeypatch.setattr("isa_nrsfm._joint.consensus.share_of_first", lambda *_: 1)
         kinds = ("joint", "consensus")

@@ -38,7 +38,7 @@ from isa_nrsfm._tables import spread
 # Largest numbers of frames and directions, and steps, and largest squared error of the
 # depths by other explanations: docs/benchmarks/README.md, "Thresholds".
 MOST_FRAMES, MOST_DIRECTIONS, MOST_STEPS = 600, 24, 50
-MOST_DEFORMATION = 0.01
+MOST_DEFORMATION = 0.08
 
 
 def bagged(
