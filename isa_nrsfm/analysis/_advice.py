@@ -34,7 +34,7 @@ SAME_UNIT = (
 # above which it is poor; errors of depths likewise, of which the second withholds them.
 # Few points and frames: docs/benchmarks/README.md, "Thresholds".
 FIT, DEPTH = (0.02, 0.2), (0.2, LARGEST_SHARE)
-# Error of depths above which every second one was in truth above `LARGEST_SHARE`, of
+# Error of depths above which every third one was in truth above `LARGEST_SHARE`, of
 # fits without a prior: docs/depth.md, "Undetermined depth".
 DOUBTFUL = 0.4
 FEW_POINTS = 10
@@ -200,7 +200,7 @@ def depth_advice(facts: Facts) -> str:
     error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
     state, result = "not determined", "Angles and proportions are withheld"
     if certainty.determined:
-        error += f", and over {100 * LARGEST_SHARE:.0f} % in half of such fits in tests"
+        error += f", and over {100 * LARGEST_SHARE:.0f} % in a third of such fits in tests"
         state, result = "doubtful", "Compare angles and proportions with known ones"
     text = f"the depth of the shapes is {state}: {error}"
     if facts.bent:
