@@ -200,7 +200,7 @@ def depth_advice(facts: Facts) -> str:
     error = f"its expected error is {100 * certainty.total:.0f} % of the depth"
     state, result = "not determined", "Angles and proportions are withheld"
     if certainty.determined:
-        error += f", and over {100 * LARGEST_SHARE:.0f} % in a third of such fits in tests"
+        error += f", and over {100 * LARGEST_SHARE:.0f} % in a third of such tests"
         state, result = "doubtful", "Compare angles and proportions with known ones"
     text = f"the depth of the shapes is {state}: {error}"
     if facts.bent:
