@@ -39,6 +39,7 @@ def errors(table, points):
     return found - truth
 
 
+@pytest.mark.filterwarnings("ignore:the depth of the shapes is doubtful")
 @pytest.mark.parametrize(("name", "missing"), slow_after(1, product(MAKE, [0.0, 0.2])))
 def test_deviations_are_those_of_the_errors(name, missing):
     params = {"camera": "weak_perspective", "random_state": 0}
