@@ -260,6 +260,7 @@ def test_calibrated_cameras(fits, tmp_path, camera):
     assert f"{camera.replace('_', '-')} cameras" in page
 
 
+@pytest.mark.slow
 def test_perspective_cameras(fits, fails, transforms, tmp_path):
     f, centre = 900.0, (640.0, 360.0)
     near = {"camera": "perspective", "focal_length": f, "distance": 300.0}

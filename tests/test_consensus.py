@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from frame_parts import depth_errors
-from layers import Quick
+from layers import Quick, slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of
 from scenes import with_gaps
@@ -476,7 +476,7 @@ class TestEstimator:
         joint, found = (in_camera(model, X[:20])[:, :, 2] for model in models)
         assert np.std(found - joint) < 0.15 * np.std(joint)  # groups alone: 2
 
-    @pytest.mark.parametrize("noise", [0.0, 0.02])
+    @pytest.mark.parametrize("noise", slow_after(1, [0.0, 0.02]))
     def test_a_sufficient_joint_fit_is_kept(self, noise):
         """Groups change no fit whose noise is below their floor or the spectrum's."""
         options = {"camera": "orthographic", "noise": noise, "random_state": 0}

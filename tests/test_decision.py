@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from fit_runs import QUICK
 from landmark_files import deeplabcut_frame, saved, write_deeplabcut
-from layers import slow_after, with_limits
+from layers import with_limits
 from refusals import refusals_of
 from scenes import with_outliers
 from sklearn.base import clone
@@ -75,7 +75,8 @@ def fitted(estimator, X):
     return model, [*found.messages, *texts], found
 
 
-@pytest.mark.parametrize("name", slow_after(1, [*TABLES]))
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TABLES)
 def test_advice_ends_after_one_more_fit_which_is_not_worse(name):
     X = TABLES[name]()
     model, messages, before = fitted(AffineNRSfM(random_state=0), X)
@@ -103,6 +104,7 @@ def tried(X, **options):
     return {each.setting: each for each in auto.trials_}, auto.best_estimator_
 
 
+@pytest.mark.slow
 def test_robust_losses_are_tried_if_there_are_outliers():
     given = {"camera": "affine", "refinement": "joint", "n_components": 2}
     found, model = tried(TABLES["outliers"](), **given)

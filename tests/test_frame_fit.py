@@ -399,6 +399,7 @@ def test_deviations_of_frames_grow_with_their_residual(turned):
     assert 2 < np.median(after / before) < 4
 
 
+@pytest.mark.slow
 def test_outliers_are_left_out_with_a_robust_loss(rng):
     shapes = rng.normal(size=(2, 3, 20)) * [[[1.0]], [[0.1]]]
     shapes -= shapes.mean(axis=2, keepdims=True)

@@ -167,7 +167,8 @@ class TestNoiseVariance:
 
 class TestLargeTables:
     @EACH
-    @pytest.mark.parametrize("gaps", slow_after(1, [False, True]))
+    @pytest.mark.slow
+    @pytest.mark.parametrize("gaps", [False, True])
     def test_end_where_small_ones_do(self, gaps, camera):
         seen_by = camera if camera == "orthographic" else "weak_perspective"
         tracks, truth = random_table(seen_by, n_frames=200)

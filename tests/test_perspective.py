@@ -77,9 +77,10 @@ def noisy():
     return table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seed", "size"),
-    slow_after(1, [(0, (25, 12)), *((n, (40, 16)) for n in range(20))]),
+    [(0, (25, 12)), *((n, (40, 16)) for n in range(20))],
 )
 def test_without_noise_the_fit_is_exact(seed, size):
     n_frames, n_points = size

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pandas as pd
 import pytest
-from layers import Quick, slow_after
+from layers import Quick
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
@@ -40,7 +40,8 @@ def errors(table, points):
 
 
 @pytest.mark.filterwarnings("ignore:the depth of the shapes is doubtful")
-@pytest.mark.parametrize(("name", "missing"), slow_after(1, product(MAKE, [0.0, 0.2])))
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "missing"), [*product(MAKE, [0.0, 0.2])])
 def test_deviations_are_those_of_the_errors(name, missing):
     params = {"camera": "weak_perspective", "random_state": 0}
     if name == "near":

@@ -247,7 +247,8 @@ def test_deviations_have_the_width_of_the_prior_without_a_jackknife(turned, tmp_
     assert (np.sqrt(frames.certainty.points) > 0.2 * model.prior_std_[0]).all()
 
 
-@pytest.mark.parametrize("loss", slow_after(1, ["cauchy", "huber"]))
+@pytest.mark.slow
+@pytest.mark.parametrize("loss", ["cauchy", "huber"])
 def test_outliers(frontal, loss):
     X = with_outliers(frontal.X, 100, seed=3)
     X[:, 10:12] = np.nan
@@ -266,7 +267,8 @@ def test_orthographic_cameras():
     assert np.sqrt(np.mean(model.reconstruct(table.X) ** 2)) == pytest.approx(size, 0.1)
 
 
-@pytest.mark.parametrize("focal_length", slow_after(1, [800.0, None]))
+@pytest.mark.slow
+@pytest.mark.parametrize("focal_length", [800.0, None])
 def test_perspective_cameras(turned, focal_length):
     """The prior may be the mirror image of the objects."""
     table = study(1, 20, 4, change=0.04, focal=800)
