@@ -900,9 +900,9 @@ def _consensus(best: _Fit, rows: _Rows) -> Proposal:
     if best.model.camera == "affine" or rows.weights:
         return "not with affine cameras or weights"
     cue = best.model.prior or best.model.camera == "perspective"
-    if advice.known_depth(best.model):
-        if cue or rows.own_rotations(best.model) < OWN_ROTATIONS:
-            return "the depth is known"
+    known = advice.known_depth(best.model)
+    if known and (cue or rows.own_rotations(best.model) < OWN_ROTATIONS):
+        return "the depth is known"
     return {"refinement": "consensus"}
 
 

@@ -274,10 +274,8 @@ def test_the_steadiest_fit_is_more_evident_than_its_start(depth):
     motion = np.where(np.arange(24)[:, None, None] < 6, mirror, 1.0) * scene.motion
     start = JointState(lifted_shapes(rows, motion, 2), motion, 0.1)
     first = extended(problem, problem.refined(start, max_iter=20).state, 4)
-    best, fit = (
-        steadiest(problem, table, first),
-        whole_distribution(problem, first.state),
-    )
+    best = steadiest(problem, table, first)
+    fit = whole_distribution(problem, first.state)
     assert evidence(problem, best) < evidence(problem, fit) - 0.5
     # Other depths count by their evidence, mirror images not at all.
     shapes, motion, noise = best.state
@@ -405,6 +403,7 @@ def test_frames_of_flat_objects_may_be_reversed(camera):
         blocks = FrameBlocks.of_array(rows, n_frames)
         problem = JointProblem(JointFrames.from_points(blocks, True), settings)
         depths = state.depths(problem.likelihood(*state).alpha)
+        assert_allclose(problem.reversal_errors(state), expected, atol=0.02)
         error = reversal_error(problem, state, depths)
         assert_allclose(error, expected, atol=0.1)  # of fitted shapes
 

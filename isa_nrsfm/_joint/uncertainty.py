@@ -55,7 +55,7 @@ from isa_nrsfm._joint.prior import ShapePrior
 from isa_nrsfm._joint.problem import JointFit, JointProblem, JointState, refine_joint
 from isa_nrsfm._joint.settings import FitSettings
 from isa_nrsfm._joint.starts import camera_moments, other_depths, steadied, stretched
-from isa_nrsfm._joint.whole import FAR_FRAMES, extended, n_directions
+from isa_nrsfm._joint.whole import FAR_FRAMES, extended, n_directions, relative_change
 from isa_nrsfm._linalg import OF_DISTANCES, centred, lengths
 from isa_nrsfm._prepare.robust import frame_weights, robust_sizes
 from isa_nrsfm._prepare.scaling import ScaledTable
@@ -368,11 +368,9 @@ def turning_error(
     errors = []
     for start, factor in (state, DEEPER), (state, FAR), (still, FAR):
         _, _, z, end = refit(stretched(start, camera, factor)[0])
-        z *= np.copysign(1.0, np.sum(z * found))
-        square = max(np.sum(found**2), 1e-300)
-        change = min(np.sum((z - found) ** 2) / square, 1.0)
-        errors.append(change * np.exp(-FAR_FRAMES * max(end - value, 0.0)))
-    return float(max(errors))
+        probability = np.exp(-FAR_FRAMES * max(end - value, 0.0))
+        errors.append(float(min(relative_change(found, z), 1.0) * probability))
+    return max(errors)
 
 
 def reversal_error(problem: JointProblem, state: JointState, depths: NDArray) -> float:
@@ -387,8 +385,8 @@ def reversal_error(problem: JointProblem, state: JointState, depths: NDArray) ->
     fold = np.random.RandomState(0).permutation(len(motion)) % n_folds
     known = shapes if problem.settings.shape_prior is not None else shapes[:1]
     total = 0.0
-    for members in (fold == number for number in range(n_folds)):
-        own, others = np.flatnonzero(members), np.flatnonzero(~members)
+    for number in range(n_folds):
+        own, others = np.flatnonzero(fold == number), np.flatnonzero(fold != number)
         part = problem.part(others, problem.settings.tol)
         n = min(len(shapes) - 1, n_directions(part, shapes.shape[2], few=True))
         fit = extended(part, JointState(known, motion[others], noise), n)

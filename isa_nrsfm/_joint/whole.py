@@ -25,6 +25,7 @@ vanishes as soon as there are enough directions to explain a frame by them.
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from isa_nrsfm._frames.camera_models import full_rotations
 from isa_nrsfm._joint.problem import JointFit, JointProblem, JointState, Widths, regular
@@ -177,7 +178,15 @@ def rival_depths(problem: JointProblem, fits: list[tuple[float, JointFit]]) -> f
     parts = ((replace(problem, widths=fit.widths), fit.state) for _, fit in fits)
     z, *others = (part.depths(state) for part, state in parts)
     for (value, _), other in zip(fits[1:], others, strict=True):
-        other *= np.copysign(1.0, np.sum(other * z))
-        square = np.sum((other - z) ** 2) / np.sum(z**2)
-        total += np.exp(-FAR_FRAMES * max(value - best, 0.0)) * square
+        probability = np.exp(-FAR_FRAMES * max(value - best, 0.0))
+        total += probability * relative_change(z, other)
     return float(total)
+
+
+def relative_change(z: NDArray, other: NDArray) -> float:
+    """Return the relative squared difference of other depths, or of their mirror image.
+
+    That of the nearer ones, over the squared depths z.
+    """
+    other = other * np.copysign(1.0, np.sum(other * z))
+    return float(np.sum((other - z) ** 2) / max(np.sum(z**2), 1e-300))
