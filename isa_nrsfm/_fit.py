@@ -49,7 +49,7 @@ from isa_nrsfm._joint.consensus import MOST_FIRST, consensus
 from isa_nrsfm._joint.likelihood import JointFrames
 from isa_nrsfm._joint.problem import FactorisedTable, JointState, Widths
 from isa_nrsfm._joint.settings import JOINT_TOL, FitSettings
-from isa_nrsfm._joint.starts import extended_shapes, lifted_shapes, rigid_start
+from isa_nrsfm._joint.starts import calibrated_start, extended_shapes, lifted_shapes
 from isa_nrsfm._parameters import JOINT_REFINEMENTS
 from isa_nrsfm._prepare import scaling
 from isa_nrsfm._prepare.completion import complete_rows
@@ -409,7 +409,8 @@ def _paper_fit(
     table = factorised.scaled
     if s.camera != "affine":
         scaled = s.camera == "weak_perspective"
-        shapes = table.sizes[0] * rigid_start(factorised.factors, shapes, scaled)[1]
+        rigid = factorised.factors.rigid_motion.reshape(-1, 2, 3)
+        shapes = table.sizes[0] * calibrated_start(rigid, shapes, scaled)[1]
 
     def fitted() -> tuple[TableModel, Decomposition]:
         frames, K = FrameModel.rigid(mean_shape, basis, s.camera), len(basis)

@@ -5,8 +5,9 @@
    the images better than rotations do.
 2. The fit of calibrated cameras, shapes and noise, with a floor of the noise variance.
    Otherwise unmodelled deformation would distort depths and cameras.
-3. The fit of affine cameras, from 2 and from the paper's result. The one with the lower
-   objective is kept. With calibrated cameras it only serves for comparison.
+3. The fit of affine cameras, from the paper's result and from 2. The one with the lower
+   objective is kept. With calibrated cameras it only serves for comparison; if the
+   first one explains the table, 1 and 2 are left out.
 4. The decision whether K is sufficient: if the residual does not exceed the noise level
    of the spectrum. Then the fit is repeated without floor and prior.
 
@@ -102,6 +103,7 @@ def fit_jointly(
     problems = _problems(table, paper_shapes, settings)
     first, all_directions = next(problems), settings.all_directions
     few_directions = partial(n_directions, first, paper_shapes.shape[2])
+    judgement: Any = settings.limits.least_noise, False
     # Fit of the sample (of all frames if it is the table), and judgement of the model
     if start is not None:
         start = _of_sample(first, table, start)
@@ -118,10 +120,12 @@ def fit_jointly(
             fit = extended(first, fit.state, few_directions(few=True))
     elif all_directions:
         fit = _likeliest_fit(first, table, paper_shapes)
-    else:
+    elif first.cameras.calibrated:
         fit, start = _first_fit(first, table, paper_shapes)
-    ratio, rivals, penalty = fit.camera_noise_ratio, 0.0, first.penalty
-    least_noise, sufficient = settings.limits.least_noise, False
+    else:
+        fit, *judgement = _affine_fit(first, table, paper_shapes)
+    ratio, rivals = fit.camera_noise_ratio, 0.0
+    least_noise, sufficient = judgement
     if all_directions:
         fit = steadiest(first, table, fit)
         rivals = fit.rivals
@@ -132,11 +136,11 @@ def fit_jointly(
             fit = whole_distribution(first, extended(first, fit.state, n_max).state)
         fit, least_noise = explained(first, table, fit, every_point)
     elif fit.prior is None:
-        assert start is not None
-        fit, least_noise, sufficient = judged(first, table, fit, start)
-        penalty = 0.0 if sufficient else first.penalty
+        if start is not None:
+            fit, least_noise, sufficient = judged(first, table, fit, start)
     elif table.outliers is None:  # with them the widths follow the weights
         fit = deepened(first, widened(first, fit))
+    penalty = 0.0 if sufficient else first.penalty
 
     def of_all(larger: JointProblem) -> JointProblem:
         """Return a problem with the priors of the fit of the sample."""
@@ -326,7 +330,7 @@ def count_components(
     Arguments as in `fit_jointly`, with more basis shapes than are expected.
     """
     problem = next(_problems(table, paper_shapes, settings))
-    fit, _ = _first_fit(problem, table, paper_shapes)
+    fit, *_ = _affine_fit(problem, table, paper_shapes)
     widths = whole_distribution(problem, fit.state).widths
     assert widths is not None
     return widths.n_relevant
@@ -359,28 +363,57 @@ def _visible_frames(table: FactorisedTable) -> JointFrames:
 def _first_fit(
     problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray, **limits: Any
 ) -> tuple[JointFit, JointState]:
-    """Return the fit of the sample, with its noise ratio, and one of its starts."""
-    settings, calibrated = problem.settings, problem.cameras.calibrated
+    """Return the fit of calibrated cameras, with its noise ratio, and its start."""
+    fit, start = _calibrated_fit(problem, table, paper_shapes, **limits)
+    max_iter = min(problem.settings.max_iter, 60)  # affine cameras are only compared
     affine = replace(problem, seen_by=CAMERAS["affine"])
+    state, _ = _paper_start(affine, table, paper_shapes)
+    fits = [affine.refined(s, max_iter=max_iter) for s in (fit.state, state)]
+    return _compared(fit, min(fits, key=_end), fit), start
+
+
+def _affine_fit(
+    problem: JointProblem, table: FactorisedTable, paper_shapes: NDArray
+) -> tuple[JointFit, float, bool]:
+    """Return the judged fit of affine cameras, with its noise ratio, as `judged` does.
+
+    Calibrated starts take most of the time. They are left out if the fit from the
+    paper's result explains the table to the noise of its spectrum: then a calibrated
+    fit from its cameras serves for comparison.
+    """
     weak = replace(problem, seen_by=CAMERAS["weak_perspective"])
-    first = problem if calibrated else weak
-    fit, start = _calibrated_fit(first, table, paper_shapes, **limits)
-    # Affine cameras, from the calibrated fit and from the paper's result
-    rigid = starts.affine_start(problem, table.W, paper_shapes)
-    # Some steps without the prior: with the large noise of a start it would make basis
-    # shapes vanish.
-    free = replace(affine, penalty=0.0)
-    state = free.refined(rigid, max_iter=starts.FIXED_STEPS, tol=settings.tol).state
-    states = [fit.state, starts.with_prior(problem, state)]
-    # With calibrated cameras, affine ones are only compared.
-    max_iter = min(settings.max_iter, 60) if calibrated else settings.max_iter
-    if not problem.thorough:  # only the better one continues
-        raced = (affine.refined(state, max_iter=min(max_iter, 5)) for state in states)
-        states = [min(raced, key=_end).state]
-    other = min((affine.refined(s, max_iter=max_iter) for s in states), key=_end)
-    ratio = fit.misfit / min(other.misfit, fit.misfit)
-    fit, start = (fit, start) if calibrated else (other, rigid)
-    return fit._replace(camera_noise_ratio=ratio), start
+    state, rigid = _paper_start(problem, table, paper_shapes)
+    fit = problem.refined(state)
+    released, least_noise, sufficient = judged(problem, table, fit)
+    if sufficient:
+        motion, shapes = starts.calibrated_start(fit.state.motion, fit.state.shapes)
+        state = fit.state._replace(motion=motion, shapes=shapes)
+        calibrated = weak.unreversed(starts.with_prior(weak, state))
+        return _compared(calibrated, fit, released), least_noise, True
+    calibrated, _ = _calibrated_fit(weak, table, paper_shapes)
+    fit = min(fit, problem.refined(calibrated.state), key=_end)
+    released, least_noise, sufficient = judged(problem, table, fit, rigid)
+    return _compared(calibrated, fit, released), least_noise, sufficient
+
+
+def _paper_start(
+    affine: JointProblem, table: FactorisedTable, paper_shapes: NDArray
+) -> tuple[JointState, JointState]:
+    """Return the paper's result after some steps of affine cameras, and itself.
+
+    The steps are without the prior: with the large noise of a start it would make basis
+    shapes vanish.
+    """
+    rigid = starts.affine_start(affine, table.W, paper_shapes)
+    limits = {"max_iter": starts.FIXED_STEPS, "tol": affine.settings.tol}
+    state = replace(affine, penalty=0.0).refined(rigid, **limits).state
+    return starts.with_prior(affine, state), rigid
+
+
+def _compared(calibrated: JointFit, affine: JointFit, fit: JointFit) -> JointFit:
+    """Return a fit with the noise ratio of fits with both kinds of cameras."""
+    ratio = calibrated.misfit / min(affine.misfit, calibrated.misfit)
+    return fit._replace(camera_noise_ratio=ratio)
 
 
 def _calibrated_fit(
@@ -397,26 +430,26 @@ def _end(fit: JointFit) -> float:
 
 
 def judged(
-    problem: JointProblem, table: FactorisedTable, fit: JointFit, start: JointState
+    problem: JointProblem, table: FactorisedTable, fit: JointFit, *starts: JointState
 ) -> tuple[JointFit, float, bool]:
     """Decide whether K is sufficient and refit accordingly.
 
     Returns the fit, its noise floor and the decision. K is sufficient if the residual
     does not exceed the noise level of the spectrum. Then the fit is repeated without
-    floor and prior, from its result and from its start. The result lacks deformation
-    below the floor.
+    floor and prior, from its result, or else from the given starts. The result lacks
+    deformation below the floor.
 
     Otherwise the fit keeps them: missing deformation would distort cameras and depths.
     """
     limits, mean_square = problem.settings.limits, problem.mean_square
     least_noise = limits.least_noise
     # A spectrum of only 3K + 3 singular values has no noise.
-    noise_level = table.noise_level(len(start.shapes) - 1)
+    noise_level = table.noise_level(len(fit.state.shapes) - 1)
     threshold = max(limits.right * noise_level, 1e-10) * mean_square
     at_floor = fit.state.noise < (1 + 1e-3) * least_noise * mean_square
     # Sufficient: without floor and prior
     if at_floor or fit.state.noise < threshold:
-        for state in (fit.state, start):
+        for state in (fit.state, *starts):
             released = unregularised(problem, state)
             if released.state.noise < threshold:
                 return released, NOISE_FLOOR, True

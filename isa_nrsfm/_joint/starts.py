@@ -31,24 +31,23 @@ from isa_nrsfm.calibration._orthonormal_cameras import (
     orthonormal_mixture,
     principal_columns,
 )
-from isa_nrsfm.isa._pipeline import Factorisation, rigid_energy
+from isa_nrsfm.isa._pipeline import rigid_energy
 
 # Largest number of steps of a start with fixed cameras.
 FIXED_STEPS = 6
 
 
-def rigid_start(
-    factors: Factorisation, paper_shapes: NDArray, scaled: bool
+def calibrated_start(
+    motion: NDArray, shapes: NDArray, scaled: bool = True
 ) -> tuple[NDArray, NDArray]:
-    """Return the paper's result with calibrated cameras (I, 2, 3) and its shapes.
+    """Return calibrated cameras near affine ones (I, 2, 3), and their shapes.
 
-    After a metric upgrade of the rigid cameras, takes the nearest calibrated ones.
-    Unless `scaled`, all cameras have scale one.
+    After a metric upgrade, takes the nearest calibrated ones. Unless `scaled`, all
+    cameras have scale one.
     """
-    rigid = factors.rigid_motion.reshape(-1, 2, 3)
-    Q = best_metric(rigid)
-    rows, sizes = nearest_calibrated(rigid @ Q)
-    shapes = np.linalg.solve(Q, paper_shapes)
+    Q = best_metric(motion)
+    rows, sizes = nearest_calibrated(motion @ Q)
+    shapes = np.linalg.solve(Q, shapes)
     if scaled:
         return sizes[:, None, None] * rows, shapes
     return rows, sizes.mean() * shapes
@@ -249,7 +248,8 @@ def best_starts(
         trials.append((fit.history[-1], fit.state, motion))
 
     # Rigid cameras, with the paper's and with lifted basis shapes
-    motion, shapes = rigid_start(factors, frames.coordinates(paper), scaled)
+    rigid, shapes = factors.rigid_motion.reshape(-1, 2, 3), frames.coordinates(paper)
+    motion, shapes = calibrated_start(rigid, shapes, scaled)
     compare(motion, _scaled(seen, motion[sample], shapes))
     compare(motion)
     # Mixtures of more and more columns, until the objective rises. Small tables use all
