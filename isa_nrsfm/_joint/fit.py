@@ -99,48 +99,13 @@ def fit_jointly(
     are centred and mixed such that alpha ~ N(0, I). The noise is corrected for degrees
     of freedom.
     """
-    every_point = table.scaled.complete and table.scaled.weights is None
     problems = _problems(table, paper_shapes, settings)
-    first, all_directions = next(problems), settings.all_directions
-    few_directions = partial(n_directions, first, paper_shapes.shape[2])
-    judgement: Any = settings.limits.least_noise, False
+    first = next(problems)
     # Fit of the sample (of all frames if it is the table), and judgement of the model
-    if start is not None:
-        start = _of_sample(first, table, start)
-        if not len(start.motion):
-            start = first.aligned(start)
-        if settings.prior is None:  # a fit without the prior has larger basis shapes
-            start = starts.with_prior(first, start)
-        # The widths of a prior change its first fit. All directions have another one.
-        rough: dict[str, Any] = {"max_iter": 0} if all_directions else {}
-        if settings.prior is not None:
-            rough = {"tol": settings.tol / TOL_SHARE}
-        fit = first.unreversed(start, **rough)
-        if all_directions:
-            fit = extended(first, fit.state, few_directions(few=True))
-    elif all_directions:
-        fit = _likeliest_fit(first, table, paper_shapes)
-    elif first.cameras.calibrated:
-        fit, start = _first_fit(first, table, paper_shapes)
-    else:
-        fit, *judgement = _affine_fit(first, table, paper_shapes)
-    ratio, rivals = fit.camera_noise_ratio, 0.0
-    least_noise, sufficient = judgement
-    if all_directions:
-        fit = steadiest(first, table, fit)
-        rivals = fit.rivals
-        # More directions, if the table supports all of the first ones
-        few = bool(table.parts) or not every_point or table.outliers is not None
-        n_max = few_directions(few)
-        if len(fit.state.shapes) - 1 == FEW_DIRECTIONS < n_max:
-            fit = whole_distribution(first, extended(first, fit.state, n_max).state)
-        fit, least_noise = explained(first, table, fit, every_point)
-    elif fit.prior is None:
-        if start is not None:
-            fit, least_noise, sufficient = judged(first, table, fit, start)
-    elif table.outliers is None:  # with them the widths follow the weights
-        fit = deepened(first, widened(first, fit))
-    penalty = 0.0 if sufficient else first.penalty
+    of_sample, least_noise, sufficient = _fit_of_sample(
+        first, table, paper_shapes, start
+    )
+    fit, penalty = of_sample, 0.0 if sufficient else first.penalty
 
     def of_all(larger: JointProblem) -> JointProblem:
         """Return a problem with the priors of the fit of the sample."""
@@ -161,7 +126,7 @@ def fit_jointly(
             state = problem.aligned(fit.state, further)
             fit = problem.refined(state, least_noise=least_noise)
     n_pose = 2 + first.cameras.n_parameters
-    if table.compressed and table.outliers is None and not every_point:
+    if table.compressed and table.outliers is None and not table.every_point:
         # After completed frames, the points that are seen, and weights
         shapes = problem.frames.points(fit.state.shapes)
         problem = replace(problem, frames=_visible_frames(table))
@@ -179,8 +144,69 @@ def fit_jointly(
         n_seen = table.scaled.n_seen
         noise *= _freedom_correction(n_seen, shapes.shape, n_pose, fit.prior)
     end = JointState(centred(shapes), fit.state.motion, max(noise, OF_DISTANCES**2))
+    ratio, rivals = of_sample.camera_noise_ratio, of_sample.rivals
     fit = fit._replace(state=end, camera_noise_ratio=ratio, rivals=rivals)
     return fit, problem.frames, first.likelihood(*state).alpha
+
+
+def _fit_of_sample(
+    problem: JointProblem,
+    table: FactorisedTable,
+    paper_shapes: NDArray,
+    start: JointState | None,
+) -> tuple[JointFit, float, bool]:
+    """Return the fit of the first sample, its noise floor, and if K is sufficient."""
+    settings, all_directions = problem.settings, problem.settings.all_directions
+    least_noise = settings.limits.least_noise
+    if start is not None:
+        fit, start = _continued(problem, table, start)
+    elif all_directions:
+        fit = _likeliest_fit(problem, table, paper_shapes)
+    elif problem.cameras.calibrated:
+        fit, start = _first_fit(problem, table, paper_shapes)
+    else:
+        return _affine_fit(problem, table, paper_shapes)
+    ratio, rivals, sufficient = fit.camera_noise_ratio, fit.rivals, False
+    if all_directions:
+        fit = steadiest(problem, table, fit)
+        rivals = fit.rivals
+        # More directions, if the table supports all of the first ones
+        few = bool(table.parts) or not table.every_point or table.outliers is not None
+        n_max = n_directions(problem, paper_shapes.shape[2], few)
+        if len(fit.state.shapes) - 1 == FEW_DIRECTIONS < n_max:
+            state = extended(problem, fit.state, n_max).state
+            fit = whole_distribution(problem, state)
+        fit, least_noise = explained(problem, table, fit)
+    elif fit.prior is None:
+        assert start is not None
+        fit, least_noise, sufficient = judged(problem, table, fit, start)
+    elif table.outliers is None:  # with them the widths follow the weights
+        fit = deepened(problem, widened(problem, fit))
+    return (
+        fit._replace(camera_noise_ratio=ratio, rivals=rivals),
+        least_noise,
+        sufficient,
+    )
+
+
+def _continued(
+    problem: JointProblem, table: FactorisedTable, start: JointState
+) -> tuple[JointFit, JointState]:
+    """Return the fit of the sample from a start of all frames, and this start."""
+    settings, n_points = problem.settings, start.shapes.shape[2]
+    start = _of_sample(problem, table, start)
+    if not len(start.motion):
+        start = problem.aligned(start)
+    # The widths of a prior change its first fit. All directions have another one.
+    rough: dict[str, Any] = {"max_iter": 0} if settings.all_directions else {}
+    if settings.prior is None:  # a fit without the prior has larger basis shapes
+        start = starts.with_prior(problem, start)
+    else:
+        rough = {"tol": settings.tol / TOL_SHARE}
+    fit = problem.unreversed(start, **rough)
+    if settings.all_directions:
+        fit = extended(problem, fit.state, n_directions(problem, n_points, few=True))
+    return fit, start
 
 
 def _of_sample(
@@ -457,7 +483,7 @@ def judged(
 
 
 def explained(
-    problem: JointProblem, table: FactorisedTable, fit: JointFit, every_point: bool
+    problem: JointProblem, table: FactorisedTable, fit: JointFit
 ) -> tuple[JointFit, float]:
     """Return the fit of all directions with their widths, and its noise floor.
 
@@ -468,7 +494,7 @@ def explained(
     """
     widths, tol = fit.widths, problem.settings.tol
     assert widths is not None
-    n_known = len(widths.variances) + (0 if every_point else 3)
+    n_known = len(widths.variances) + (0 if table.every_point else 3)
     if table.explained_by(n_known, LEAST_NOISE):
         n = widths.n_relevant
         state = fit.state._replace(shapes=fit.state.shapes[: n + 1])

@@ -68,6 +68,11 @@ class FactorisedTable(NamedTuple):
     parts: list[NDArray]
     factors: Factorisation
 
+    @property
+    def every_point(self) -> bool:
+        """Whether all points of all frames count in full."""
+        return self.scaled.complete and self.scaled.weights is None
+
     def rest_share(self, n: int) -> float:
         """Return the share of the energy outside of the n leading singular values."""
         squares = self.singular_values**2
