@@ -171,20 +171,20 @@ def _swept(packed: NDArray, first: int) -> tuple[NDArray, NDArray]:
     """Sweep each matrix by its Cholesky factor, or by `_eliminated` without one."""
     places = _places(math.isqrt(2 * len(packed)))
     across, block = places[:first, first:], places[first:, first:]
-    G, A = packed[across], np.ascontiguousarray(packed[block].T)
-    X, upper = np.moveaxis(G, 2, 0).copy(), np.triu_indices(len(block))
+    G, upper = packed[across], pair_indices(len(block))
     # Copies of the last frame (`padded`) are solved once.
     last = np.append(True, (packed != packed[:, -1:]).any(axis=0)).nonzero()[0][-1]
-    lanes, A, X = np.minimum(np.arange(len(A)), last), A[: last + 1], X[: last + 1]
+    lanes, frames = np.minimum(np.arange(packed.shape[1]), last), packed[:, : last + 1]
+    A, X = (np.moveaxis(frames[rows], 2, 0).copy() for rows in (block, across))
     failed = [dposv(a.T, x.T, 1, 1, 1)[2] for a, x in zip(A, X, strict=True)]
-    pivots = A.diagonal(axis1=1, axis2=2)[lanes].T ** 2
+    pivots = A.diagonal(axis1=1, axis2=2).T[:, lanes] ** 2
     floors = OF_STEPS * packed[np.diag(block)]
     positive = (np.array(failed)[lanes] == 0) & (pivots > floors).all(axis=0)
     failures = np.flatnonzero(~positive)
-    left, X = packed.take(failures, -1), np.moveaxis(X[lanes], 0, 2)
+    left, X = packed.take(failures, -1), np.moveaxis(X, 0, 2)[..., lanes]
     for a in A:
         dpotri(a.T, 1, 1)
-    packed[block[upper]], packed[across] = -A[lanes][:, *upper].T, X
+    packed[block[upper]], packed[across] = -A[:, *upper].T[:, lanes], X
     packed[places[:first, :first]] -= np.einsum("rcn,scn->rsn", G, X)
     log_determinant = np.log(np.where(positive, pivots, 1.0)).sum(axis=0)
     if len(failures):
