@@ -1,7 +1,9 @@
 """A headless browser for tests, driven through a pipe by the DevTools protocol."""
 
+import base64
 import contextlib
 import fcntl
+import io
 import json
 import os
 import select
@@ -10,6 +12,7 @@ import signal
 import time
 
 import numpy as np
+from matplotlib.image import imread
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 FLAGS = (
@@ -113,6 +116,12 @@ class Browser:
         box = self.at(name, "getBoundingClientRect().toJSON()")
         return [box[side] for side in ("x", "y", "width", "height")]
 
+    def picture(self, name):
+        """Return what an element shows, (height, width, 3), from 0 to 1."""
+        place = dict(zip(("x", "y", "width", "height"), self.box(name), strict=True))
+        taken = self.call("Page.captureScreenshot", clip=place | {"scale": 1})
+        return imread(io.BytesIO(base64.b64decode(taken["data"])))[..., :3]
+
     def wait(self, condition):
         """Wait until a condition is true."""
         until = time.monotonic() + PATIENCE
@@ -170,11 +179,10 @@ class Browser:
     def _receive(self):
         """Return the next message."""
         while b"\0" not in self._rest:
-            if not select.select([self._from], [], [], PATIENCE)[0]:
-                raise TimeoutError("the browser does not answer")
-            got = os.read(self._from, 1 << 16)
+            ready, *_ = select.select([self._from], [], [], PATIENCE)
+            got = os.read(self._from, 1 << 16) if ready else b""
             if not got:
-                raise RuntimeError("the browser has gone")
+                raise TimeoutError("the browser does not answer, or has gone")
             self._rest += got
         message, _, self._rest = self._rest.partition(b"\0")
         return json.loads(message)

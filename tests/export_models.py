@@ -6,30 +6,30 @@ from made_once import made_once
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks
 
-N_FRAMES, N_COMPONENTS = 150, 3
+N_FRAMES, N_COMPONENTS = 60, 3
 HOSTILE = "</script><script>document.title = 'taken'</script><b>&amp;'\"\u2028"
 LABELS = [["neutral", HOSTILE, "smile"][i % 3] for i in range(N_FRAMES)]
 
 
 @made_once
-def faces(noise=0.005, camera="weak_perspective"):
+def faces(camera="weak_perspective"):
     """Return artificial faces seen by calibrated cameras."""
-    options = {"camera": camera, "noise": noise, "random_state": 0}
+    options = {"camera": camera, "noise": 0.005, "random_state": 0}
     return make_face_tracks(N_FRAMES, n_components=N_COMPONENTS, **options)
 
 
 @made_once
-def face_model(noise=0.005, y_up=False, seed=0):
+def face_model(y_up=False):
     """Return a model of the faces, also of images whose y points up."""
-    table = faces(noise).data * (np.tile([1, -1], 68) if y_up else 1)
-    return AffineNRSfM(N_COMPONENTS, random_state=seed).fit(table)
+    table = faces().data * (np.tile([1, -1], 68) if y_up else 1)
+    return AffineNRSfM(N_COMPONENTS, random_state=0).fit(table)
 
 
 @made_once
 def calibrated_model(camera="weak_perspective"):
     """Return a model of the faces with calibrated cameras."""
-    table = faces(camera=camera).data
-    return AffineNRSfM(N_COMPONENTS, camera=camera, random_state=0).fit(table)
+    model = AffineNRSfM(N_COMPONENTS, camera=camera, random_state=0)
+    return model.fit(faces(camera).data)
 
 
 @made_once

@@ -34,6 +34,9 @@ class Read:
         if accessor["type"] == "VEC3":
             array = array.reshape(-1, 3)
         assert len(array) == accessor["count"]
+        for bound in {"min", "max"} & {*accessor}:
+            expected = getattr(array, bound)(axis=0)
+            np.testing.assert_array_equal(np.squeeze(accessor[bound]), expected)
         return array
 
     @property

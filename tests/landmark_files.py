@@ -1,6 +1,7 @@
 """Write landmark files as the programs do to which their formats belong."""
 
 import json
+import warnings
 
 import numpy as np
 import pandas as pd
@@ -38,6 +39,19 @@ def tracks_of(landmarks):
     assert failed.dtype == bool
     assert np.isnan(values[failed]).all()
     return values.reshape(len(values), -1, 2)
+
+
+def table_of(name, tracks, parts=BODYPARTS):
+    """Return a table of points under names such as "{part}_{axis}"."""
+    names = [name.format(part=part, axis=axis) for part in parts for axis in "xy"]
+    return pd.DataFrame(tracks.reshape(len(tracks), -1), columns=names)
+
+
+def warnings_of(call, *args, **kwargs):
+    """Return the texts of the warnings of a call, and its result."""
+    with warnings.catch_warnings(record=True, action="always") as caught:
+        found = call(*args, **kwargs)
+    return " ".join(str(each.message) for each in caught), found
 
 
 def planar(tracks):
@@ -97,17 +111,17 @@ def saved_scene(path, scene, **others):
 def write_pyfeat(path, tracks, *, detector="Detector"):
     """Write a table as Fex.to_csv does."""
     n, n_points, _ = tracks.shape
-    seen = ~np.isnan(tracks).all(axis=(1, 2))
+    seen = np.where(np.isnan(tracks).all(axis=(1, 2)), np.nan, 1.0)
     columns = {"frame": np.arange(n)} if detector != "Detectorv2" else {}
-    for side in ("X", "Y", "Width", "Height"):
-        columns[f"FaceRect{side}"] = np.where(seen, 100.25, np.nan)
-    columns["FaceScore"] = np.where(seen, np.linspace(0.5, 1, n), np.nan)
-    names = [f"{axis}_{j}" for axis in "xy" for j in range(n_points)]
-    points = dict(zip(names, planar(tracks).T, strict=True))
+    boxes = [f"FaceRect{side}" for side in ("X", "Y", "Width", "Height")]
+    columns |= dict.fromkeys(boxes, 100.25 * seen)
+    columns |= {"FaceScore": seen * np.linspace(0.5, 1, n)}
+    points = table_of("{axis}_{part}", tracks, range(n_points))
     if detector == "MPDetector":
-        points |= {f"z_{j}": np.where(seen, -3.5, np.nan) for j in range(n_points)}
-        names = [f"{axis}_{j}" for j in range(n_points) for axis in "xyz"]
-    columns |= {name: points[name] for name in names} | {"AU01": np.linspace(0, 1, n)}
+        points = {**points} | {f"z_{j}": -3.5 * seen for j in range(n_points)}
+    else:
+        points = points[sorted(points, key=lambda name: name[0])]
+    columns |= {**points, "AU01": np.linspace(0, 1, n)}
     if detector == "Detectorv2":
         columns |= {f"Identity_{j}": np.zeros(n) for j in range(1, 513)}
         columns |= {f"mesh_{a}_{j}": np.full(n, 9.0) for a in "xyz" for j in range(478)}
@@ -116,12 +130,11 @@ def write_pyfeat(path, tracks, *, detector="Detector"):
 
 def write_mesh(path, tracks, *, shares=True, sizes=False):
     """Write the points of MediaPipe's face mesh with names such as x_0, y_0, z_0."""
-    values = tracks / IMAGE_SIZE if shares else tracks
+    parts, size = range(tracks.shape[1]), IMAGE_SIZE
+    table = table_of("{axis}_{part}", tracks / size if shares else tracks, parts)
     columns = {"code": [f"{i:03d}" for i in range(len(tracks))]}
-    if sizes:
-        columns |= {"image_width": IMAGE_SIZE[0], "image_height": IMAGE_SIZE[1]}
-    for j, (x, y) in enumerate(values.transpose(1, 2, 0)):
-        columns |= {f"x_{j}": x, f"y_{j}": y, f"z_{j}": -0.01}
+    columns |= {"image_width": size[0], "image_height": size[1]} if sizes else {}
+    columns |= dict(table) | dict.fromkeys((f"z_{j}" for j in parts), -0.01)
     return saved(path, pd.DataFrame(columns))
 
 
@@ -368,16 +381,10 @@ def to(name, write, *args, **options):
     return lambda folder: write(folder / name, *args, **options)
 
 
-def again(name, suffix, **options):
-    """Return what saves a csv file as another table, as people do with pandas."""
-
-    def write(folder):
-        frame = pd.read_csv(path := WRITERS[name](folder))
-        path.unlink()
-        sign = "," if suffix == ".csv" else "\t"
-        return saved(path.with_suffix(suffix), frame, sep=sign, **options)
-
-    return write
+def saved_by_pandas(folder):
+    """Return a file of DeepLabCut that was read and saved again by pandas."""
+    path = write_deeplabcut(folder / "a.csv", FRAME)
+    return saved(path, pd.read_csv(path))
 
 
 TRACKS, MESH, WFLW = scene(), scene(4, 478), scene(4, 98)
@@ -396,15 +403,13 @@ POSES = [[openpose_person(pose=row)] for row in SCORED]
 POINTS = [[dict(zip("xy", p, strict=True)) for p in row] for row in TRACKS.tolist()]
 FOUND = [[detection(points)] for points in TRACKS]
 DETECTIONS = pd.DataFrame([detection(p, track_id=i) for i, p in enumerate(TRACKS)])
-COCO, TABLE = coco_annotations(TRACKS), pd.DataFrame(TRACKS.reshape(12, -1), columns=XY)
+COCO, TABLE = coco_annotations(TRACKS), table_of("{axis}{part}", TRACKS, range(8))
 # Of each format, files of one individual: what writes them into a folder and returns
 # their path. A further word tells variants of a format apart.
 WRITERS = {
     "openface": to("a.csv", write_openface, TRACKS),
     "openface-1": to("a.csv", write_openface, TRACKS, separator=", "),
     "openface-image": to("a.csv", write_openface, TRACKS, video=False),
-    "openface-tsv": again("openface", ".tsv"),
-    "openface-parquet": again("openface-1", ".parquet"),
     "pyfeat": to("a.csv", write_pyfeat, TRACKS),
     "pyfeat-v2": to("a.csv", write_pyfeat, TRACKS, detector="Detectorv2"),
     "pyfeat-mp": to("a.csv", write_pyfeat, MESH, detector="MPDetector"),
@@ -420,8 +425,7 @@ WRITERS = {
     "deeplabcut-fixed": to("a.h5", write_deeplabcut, FRAME, how="fixed"),
     "deeplabcut-lines": to("a.csv", write_deeplabcut, UNSCORED),
     "deeplabcut-individuals": to("a.csv", write_deeplabcut, INDIVIDUAL),
-    "deeplabcut-pandas": again("deeplabcut", ".csv"),
-    "deeplabcut-index": again("deeplabcut", ".csv", index=True),
+    "deeplabcut-pandas": saved_by_pandas,
     "sleap": to("a.h5", write_sleap, TRACKS[:, None], names=["a"]),
     "coco": to("a.json", write_json, COCO),
     "coco-unnamed": to("a.json", write_json, COCO | {"categories": [{"id": 1}]}),
@@ -451,7 +455,7 @@ WRITERS = {
     "array": to("a.npy", write_array, xy=TRACKS),
     "array-columns": to("a.npz", write_array, xy=TRACKS.reshape(12, -1)),
     "array-planar": to("a.mat", write_array, xy=TRACKS.mT, fps=30.0),
-    "table-txt": again("table", ".txt"),
+    "table-txt": to("a.txt", saved, TABLE, sep="\t"),
     "table-blanks": to("a.txt", saved, TABLE, sep=" "),
     "table-parquet": to("a.parquet", saved, TABLE),
     "table-folder": to("a", write_each, ".csv", write_row),

@@ -122,8 +122,8 @@ def test_linear_models(make, n_components):
 @pytest.mark.parametrize("kind", FILMED)
 class TestPerspective:
     def test_tables_are_images_of_the_points_before_the_camera(self, kind):
-        options = {"focal_length": 800.0, "distance": 3 * FILMED[kind]}
-        scene = MAKERS[kind](60, camera="perspective", **options, random_state=0)
+        options = {"focal_length": 800.0, "random_state": 0}
+        scene = MAKERS[kind](60, camera="perspective", **options)
         assert (scene.focal_length, scene.principal_point) == (800.0, (640.0, 360.0))
         points = scene.shapes @ scene.rotations.mT + scene.positions[:, None]
         images = 800 * points[..., :2] / points[..., 2:] + scene.principal_point
@@ -131,11 +131,8 @@ class TestPerspective:
         gram = scene.rotations @ scene.rotations.mT
         assert_allclose(gram, [np.eye(3)] * 60, atol=1e-12)
         assert_allclose(np.linalg.det(scene.rotations), 1)
-
-    def test_cameras_are_weak_perspective_ones_at_the_same_place(self, kind):
-        scene = MAKERS[kind](60, camera="perspective", random_state=0)
-        far = scene.positions[:, 2]
-        scales = scene.focal_length / far
+        # As a weak-perspective camera at the same place
+        scales = 800 / scene.positions[:, 2]
         assert_allclose(scene.motion, scales[:, None, None] * scene.rotations[:, :2])
         place = scales[:, None] * scene.positions[:, :2] + scene.principal_point
         assert_allclose(scene.translation, place)
@@ -210,18 +207,6 @@ def deformations(expressive):
 
 
 class TestFace:
-    def test_anatomy_in_image_coordinates(self):
-        x, y, z = make_face_tracks(random_state=0).neutral_shape.T
-        assert z.argmin() == 30  # tip of the nose in front
-        assert set(z.argsort()[-2:]) == {0, 16}  # ears behind
-        assert y.argmax() == 8  # chin lowest, y points down
-        assert y[17:27].max() < y[36:48].min()  # brows above eyes
-        assert y[36:48].max() < y[31:36].min() < y[48:].min()  # nostrils, then mouth
-        assert x[36:42].max() < 0 < x[42:48].min()  # the subject's right is left
-        assert_array_equal(np.argsort(x[:17]), np.arange(17))
-        assert (y[[37, 38, 43, 44]] < y[[41, 40, 47, 46]]).all()  # lids
-        assert (y[61:64] < y[[67, 66, 65]]).all()  # inner lips do not cross
-
     def test_deformations_are_symmetric_local_and_solid(self, deformations):
         face, mirror = get_skeleton("ibug-68"), np.arange(68)
         mirror[[*face.left, *face.right]] = [*face.right, *face.left]
@@ -242,14 +227,9 @@ class TestFace:
         (right, up), (left, _) = change["smile"][[48, 54], :2] * [1, -1]
         assert min(-right, left, up) > 8
         assert (change["brow raise"][17:27, 1] < -5).all()
-        assert (change["brow lower"][17:27, 1] > 0).all()
         lids = full["blink"][:, 1]
         opening = lids[[41, 40, 47, 46]] - lids[[37, 38, 44, 43]]
         assert_allclose(opening, 0, atol=0.5)  # the eyes are shut
-        assert np.ptp(full["lip pucker"][48:, 0]) < 0.6 * np.ptp(neutral[48:, 0])
-        assert (change["lip pucker"][48:, 2] < -5).all()
-        assert (change["nose wrinkle"][31:36, 1] < -4).all()
-        assert np.ptp(full["face width"][:17, 0]) > 1.05 * np.ptp(neutral[:17, 0])
 
     def test_strengths_labels_groups_and_time(self, expressive):
         faces, strength, alpha = expressive, expressive.strength, expressive.alpha
@@ -278,18 +258,8 @@ class TestFace:
         turn = np.array([[np.cos(roll), -np.sin(roll)], [np.sin(roll), np.cos(roll)]])
         expected = np.einsum("abi,ib->ia", turn, nose)
         assert_allclose(-faces.motion[:, :, 2], 2 * expected, atol=1e-12)
-        limits = np.array([45.0, 25.0, 20.0])
-        largest = np.abs(faces.angles).max(axis=0)
-        assert (largest <= limits).all()
-        assert (largest > 0.95 * limits).all()
-
-    def test_units_are_pixels(self):
-        faces = make_face_tracks(500, random_state=0)
-        scales = np.linalg.norm(faces.motion, axis=2)
-        assert 1 <= scales.min() < 1.1 < 3.8 < scales.max() <= 4 + 1e-12
-        assert (faces.translation.min(axis=0) >= (320, 240)).all()
-        assert (faces.translation.max(axis=0) <= (960, 720)).all()
-        assert 0.25 < np.sqrt(faces.noise_variance) < 0.75
+        largest = np.abs(faces.angles).max(axis=0) / [45.0, 25.0, 20.0]
+        assert ((largest > 0.95) & (largest <= 1)).all()
 
 
 class TestPeople:

@@ -19,7 +19,7 @@ from export_models import (
     faces,
 )
 from exported_files import Read, content_of, numbers
-from layers import may_not_converge
+from layers import may_not_converge, slow_after
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refusals_of, refused, warned
 from scipy.io import loadmat
@@ -98,10 +98,8 @@ def test_shapes_have_y_up_in_scenes_and_on_pages(scene, page, make, names):
     parts = [primitive["attributes"], *primitive["targets"]]
     found = np.array([read.array(part["POSITION"]) for part in parts])
     assert_allclose(found, shapes / np.ptp(shapes[0], axis=0).max(), atol=1e-6)
-    for part, points in zip(parts, found, strict=True):
-        bounds = read.document["accessors"][part["POSITION"]]
-        assert_array_equal(bounds["min"], points.min(axis=0))
-        assert_array_equal(bounds["max"], points.max(axis=0))
+    for part in parts:
+        assert {"min", "max"} <= {*read.document["accessors"][part["POSITION"]]}
     assert read.mesh["weights"] == [0.0] * N_COMPONENTS
     extras = read.mesh["extras"]
     assert extras["factor"] > 0
@@ -129,10 +127,8 @@ def test_the_animation_swings_each_basis_shape_in_turn(scene):
     (sampler,), (channel,) = animation["samplers"], animation["channels"]
     assert channel["target"] == {"node": 0, "path": "weights"}
     times = read.array(sampler["input"])
-    accessor = read.document["accessors"][sampler["input"]]
-    assert accessor["min"] == [0.0]
-    assert accessor["max"] == [times[-1]]
-    assert np.all(np.diff(times) > 0)
+    assert {"min", "max"} <= {*read.document["accessors"][sampler["input"]]}
+    assert times[0] == 0 < np.diff(times).min()
     weights = read.array(sampler["output"]).reshape(len(times), N_COMPONENTS)
     assert_array_equal(weights[[0, -1]], 0)
     assert np.all(np.count_nonzero(weights, axis=1) <= 1)
@@ -188,18 +184,13 @@ def test_a_page_is_one_file_that_asks_for_nothing(tmp_path):
     assert "{{" not in text.replace(script, "")
 
 
-CAMERAS = ["affine", "weak_perspective", "orthographic"]
-
-
-@pytest.mark.parametrize("camera", CAMERAS)
-@pytest.mark.parametrize("options", [{}, {"origin": "lower"}])
+@pytest.mark.parametrize(
+    ("camera", "options"), [("affine", {}), ("weak_perspective", {"origin": "lower"})]
+)
 def test_rotations_show_the_shapes_as_the_images_do(page, camera, options):
-    truth, model = faces(noise=0.0), face_model(noise=0.0)
-    if camera != "affine":
-        truth, model = faces(camera=camera), calibrated_model(camera)
+    truth, model = faces(), face_model() if camera == "affine" else calibrated_model()
     data = page(model, **options)
-    told = "weak_perspective" if camera == "affine" else camera
-    assert f"{told.replace('_', '-')} cameras" in data["about"]
+    assert "weak-perspective cameras" in data["about"]
     shapes = shapes_of(data).astype(float)
     rotations = numbers(data["rotations"]).reshape(-1, 3, 3)
     assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-5)
@@ -221,25 +212,25 @@ def test_mirror_images_and_origins_change_signs(page):
     assert_allclose(shapes_of(lower), shapes * [1, -1, -1], atol=1e-6)
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-def test_basis_shapes_are_those_of_the_frames(page, camera):
+@pytest.mark.parametrize("make", [face_model, calibrated_model])
+def test_basis_shapes_are_those_of_the_frames(page, make):
     # The model's, or the least squares fit to Euclidean shapes of affine cameras.
-    model = face_model() if camera == "affine" else calibrated_model(camera)
-    shapes = model.mean_shape_[None], model.basis_
-    if camera == "affine":
+    model = make()
+    shapes = np.stack([model.mean_shape_, *model.basis_])
+    if make is face_model:
         frames = model.reconstruct(faces().data, camera="weak_perspective")
         weights = np.insert(model.alpha_, 0, 1.0, axis=1)
         best = np.linalg.lstsq(weights, frames.reshape(len(frames), -1))[0]
-        shapes = np.split(best.reshape(-1, 68, 3), [1])
-    rows = np.concatenate([shapes[0] - shapes[0].mean(axis=1), shapes[1]])
+        shapes = best.reshape(-1, 68, 3)
+    shapes[0] -= shapes[0].mean(axis=0)
     drawn = shapes_of(page(model))
-    inner, expected = (np.tensordot(each, each, [2, 2]) for each in (drawn, rows))
+    inner, expected = (np.tensordot(each, each, [2, 2]) for each in (drawn, shapes))
     unit = np.linalg.norm(expected) / np.linalg.norm(inner)
     assert_allclose(unit * inner, expected, atol=1e-4 * expected.max())
 
 
 def test_deviations_have_the_size_of_the_shapes(page):
-    model, X = calibrated_model("orthographic"), faces(camera="orthographic").data
+    model, X = calibrated_model(), faces().data
     shapes, std = model.reconstruct(X, return_std=True)
     data = page(model, X=X, depth_std=std, n_frames=4)
     found = numbers(data["deviations"]).reshape(4, 68)
@@ -247,7 +238,7 @@ def test_deviations_have_the_size_of_the_shapes(page):
     mean, *basis = shapes_of(data)
     drawn = mean + np.tensordot(alpha_of(data)[0], basis, 1)
     unit = np.linalg.norm(drawn[0] - drawn[16]) / size
-    assert_allclose(found, unit * std[[0, 49, 99, 149]], rtol=1e-4)
+    assert_allclose(found, unit * std[[0, 19, 39, 59]], rtol=1e-4)
     assert page(model)["deviations"] == ""
     # One for each point counts for all frames.
     alike = np.insert(np.linspace(0.0, 1.0, 67), 3, np.nan)
@@ -410,12 +401,16 @@ def pdm():
     return point_distribution_model(face_model())
 
 
-@pytest.mark.parametrize("camera", ["weak_perspective", None])
 @pytest.mark.parametrize(
-    "make", [face_model, partial(face_model, y_up=True), calibrated_model]
+    ("make", "options"),
+    [
+        (face_model, {}),
+        (partial(face_model, y_up=True), {"camera": None}),
+        (calibrated_model, {}),
+    ],
 )
-def test_faces_stand_upright_and_look_at_the_viewer(make, camera):
-    mean = point_distribution_model(make(), camera=camera).mean
+def test_faces_stand_upright_and_look_at_the_viewer(make, options):
+    mean = point_distribution_model(make(), **options).mean
     ear, nose, other_ear, brow, chin = mean[[0, 30, 16, 19, 8]]
     assert brow[1] < nose[1] < chin[1]  # y points down
     assert ear[0] < nose[0] < other_ear[0]
@@ -446,9 +441,9 @@ def assert_true_mean(pdm, truth):
     assert (cosines / np.prod([*sizes], axis=0)).min() > 0.99
 
 
-@pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
+@pytest.mark.parametrize("camera", slow_after(1, ["weak_perspective", "orthographic"]))
 def test_models_with_calibrated_cameras_give_the_true_shapes(camera, recwarn):
-    truth, model = faces(camera=camera), calibrated_model(camera)
+    truth, model = faces(camera), calibrated_model(camera)
     pdm = point_distribution_model(model)
     again = point_distribution_model(model, camera=None)
     assert_equal(pdm, again)

@@ -9,7 +9,6 @@ import pickle
 import tracemalloc
 import warnings
 import zipfile
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -37,38 +36,29 @@ class OwnISA(PooledFastICA):
     """A strategy that is not part of the package."""
 
 
-OWN = {"OwnISA": OwnISA(n_init=2)}
-STRATEGY = FastISA(n_init=2, random_state=5)
-# Parameters of fits; the parameter `folder` stands for a folder.
+# Parameters of fits
 CALIBRATED = {"camera": "weak_perspective"}
-ALTERNATING = {"refinement": "alternating"}
 CASES = {
     "default": {},
-    "names": {},
     "planar": {"layout": "planar", "independence": None, "scale_frames": False},
-    "alternating": ALTERNATING | {"isa": STRATEGY},
-    "not refined": {"refinement": None, "keep_frames": False}
-    | {"isa": PooledFastICA(n_init=2)},
+    "alternating": {"refinement": "alternating", "isa": FastISA(n_init=2)},
+    "not refined": {"refinement": None, "keep_frames": False},
     "single precision": {},
-    "single precision, alternating": ALTERNATING | {"block_recovery": "irls"},
     "missing points": {},
     "huber": {"loss": "huber", "independence": "coefficients"},
     "weak perspective": CALIBRATED | {"loss": "cauchy"},
-    "orthographic": {"camera": "orthographic", "keep_frames": False},
-    "folder": {"keep_frames": "folder"},
-    "path of a folder": {"keep_frames": Path("folder")},
+    "folder": {},
     "mirrored": CALIBRATED | {"mirror": True},
     "prior": CALIBRATED | {"n_components": "auto", "prior": "a model"},
     "numbers of numpy": {"n_components": np.int64(2), "tol": np.float32(0.05)}
     | {"scale_frames": np.bool_(True), "loss": np.str_("linear")},
-    "OwnISA": {"refinement": None, "isa": OWN["OwnISA"]},
+    "own strategy": {"refinement": None, "isa": OwnISA(n_init=2)},
 }
 # Their tables; those of others are `TABLE`.
 TABLES = {
-    "names": pd.DataFrame(TABLE, columns=NAMES),
+    "default": pd.DataFrame(TABLE, columns=NAMES),
     "planar": np.concatenate([TABLE[:, ::2], TABLE[:, 1::2]], axis=1),
     "single precision": TABLE.astype(np.float32),
-    "single precision, alternating": TABLE.astype(np.float32),
     "missing points": HOLED,
 }
 pytestmark = [
@@ -87,10 +77,8 @@ def fitted(tmp_path_factory):
         table = TABLES.get(case, TABLE)
         parameters = {"n_components": 2, "random_state": 0, "max_iter": 3} | CASES[case]
         mirror = parameters.pop("mirror", False)
-        if str(parameters.get("keep_frames")) == "folder":
-            kind = type(parameters["keep_frames"])
-            folder = tmp_path_factory.mktemp("frames")
-            parameters["keep_frames"] = folder if kind is not str else str(folder)
+        if case == "folder":
+            parameters["keep_frames"] = tmp_path_factory.mktemp("frames")
         if "prior" in parameters:
             faces = make_face_tracks(60, n_components=2, random_state=1)
             prior = AffineNRSfM(2, camera="weak_perspective", random_state=0)
@@ -128,12 +116,6 @@ def simple_model():
         return AffineNRSfM(2, random_state=0, max_iter=3).fit(TABLE)
 
 
-def archive_of_text():
-    with zipfile.ZipFile(archive := io.BytesIO(), "w") as file:
-        file.writestr("text", "text")
-    return archive.getvalue()
-
-
 def digest_of(header, arrays):
     """Return the digest of a header and arrays, as all files of format 1 have it."""
     text = {name: value for name, value in header.items() if name != "digest"}
@@ -163,7 +145,7 @@ def assert_same(loaded, saved):
         assert getattr(found[name], "dtype", None) == getattr(value, "dtype", None)
 
 
-@pytest.mark.parametrize("case", slow_after(9, CASES))
+@pytest.mark.parametrize("case", slow_after(6, CASES))
 def test_loaded_model_equals_the_saved_one(case, fitted, path):
     model, table = fitted(case)
     save_model(model, path)
@@ -186,7 +168,7 @@ def test_loaded_model_equals_the_saved_one(case, fitted, path):
 
 
 @pytest.mark.parametrize(
-    "case", slow_after(1, ["not refined", "prior", "names", "alternating"])
+    "case", slow_after(1, ["not refined", "prior", "default", "alternating"])
 )
 def test_loaded_models_can_be_cloned_and_fitted_again(case, fitted, path):
     model, table = fitted(case)
@@ -198,14 +180,13 @@ def test_loaded_models_can_be_cloned_and_fitted_again(case, fitted, path):
     assert_array_equal(loaded.fit(table).basis_, basis)
 
 
-@pytest.mark.parametrize("name", OWN)
-def test_strategies_of_users_are_named_and_not_stored(name, fitted, path):
-    model, _ = fitted(name)
+def test_strategies_of_users_are_named_and_not_stored(fitted, path):
+    model, _ = fitted("own strategy")
     save_model(model, path)
     save_model(load_model(path), path)
     loaded = load_model(path)
     assert_array_equal(loaded.isa_.components_, model.isa_.components_)
-    refused(rf"test_io_models\.{name}\. .* only its name", loaded.fit, TABLE)
+    refused(r"test_io_models\.OwnISA\. .* only its name", loaded.fit, TABLE)
     loaded.set_params(isa=PooledFastICA(n_init=1)).fit(TABLE)
 
 
@@ -217,16 +198,17 @@ def test_a_state_of_random_numbers_is_not_stored(path):
 
 @pytest.mark.parametrize("table", [TABLE[[0] * 8], 1e140 * TABLE])
 def test_models_without_motion_and_of_large_units_are_loaded(table, path):
-    model = AffineNRSfM(1, scale_frames=False, random_state=0).fit(table)
+    model = AffineNRSfM(1, scale_frames=False, random_state=0, max_iter=3).fit(table)
     save_model(model, path)
     assert_same(load_model(path), model)
 
 
 def test_output_in_dataframes_is_kept(fitted, path):
-    model = pickle.loads(pickle.dumps(fitted("default")[0]))
-    save_model(model.set_output(transform="pandas"), path)
-    expected = model.transform(TABLE)
-    pd.testing.assert_frame_equal(load_model(path).transform(TABLE), expected)
+    model, table = fitted("default")
+    model = pickle.loads(pickle.dumps(model)).set_output(transform="pandas")
+    save_model(model, path)
+    expected = model.transform(table)
+    pd.testing.assert_frame_equal(load_model(path).transform(table), expected)
 
 
 class Stranger(AffineNRSfM):
@@ -304,13 +286,13 @@ def test_damaged_contents_with_a_right_digest_are_refused(case, fitted, tmp_path
         return header, arrays | {name: damaged_array(arrays[name], rng)}
 
     refused = 0
-    for _ in range(80):
+    for _ in range(40):
         try:
             load_model(rewritten(tmp_path, change, model))
         except ValueError as error:
             assert "model.npz cannot be read as a model" in str(error)  # noqa: PT017
             refused += 1
-    assert refused > 40
+    assert refused > 20
 
 
 test_refusals = refusals_of("io_models", globals())

@@ -1,19 +1,18 @@
 """Tables as programs write them that are not two columns for each point of one body."""
 
 import re
-import warnings
 
 import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import QUICK, begun, told_of_fit
-from landmark_files import BODYPARTS, TRACKS
+from landmark_files import BODYPARTS, TRACKS, warnings_of
 from numpy.testing import assert_array_equal
 from refusals import refusals_of, refused
 from scenes import table_of
 
-from isa_nrsfm import AffineNRSfM
+from isa_nrsfm import AffineNRSfM, FastISA
 from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import landmark_table, read_landmarks
 
@@ -34,9 +33,7 @@ KAGGLE["row_id"] = [
 
 
 def wide(name="{part}_{axis}", tracks=TRACKS, parts=BODYPARTS):
-    """Return a table of points under names such as "{part}_{axis}"."""
-    names = [name.format(part=part, axis=axis) for part in parts for axis in "xy"]
-    return pd.DataFrame(tracks.reshape(len(tracks), -1), columns=names)
+    return files.table_of(name, tracks, parts)
 
 
 def tidy(**names):
@@ -68,55 +65,47 @@ GAPS = np.where(SHOWN, 1, np.nan).repeat(2, axis=1)
 
 def read(path, **options):
     """Read a file; return texts of warnings and the error, and landmarks or None."""
-    with warnings.catch_warnings(record=True, action="always") as caught:
+
+    def found_or_error():
         try:
-            found, error = read_landmarks(path, **options), ""
-        except ValueError as raised:
-            found, error = None, str(raised)
-    return " ".join([*(str(each.message) for each in caught), error]), found
+            return "", read_landmarks(path, **options)
+        except ValueError as error:
+            return str(error), None
 
-
-def both_kinds(folder, table):
-    """Yield a table read from text and from parquet: path, what is told, landmarks."""
-    table.to_csv(text := folder / "a.csv", index=False)
-    table.to_parquet(typed := folder / "a.parquet", index=False)
-    yield from ((path, *read(path)) for path in (text, typed))
+    told, (error, found) = warnings_of(found_or_error)
+    return f"{told} {error}".strip(), found
 
 
 def advice_on(folder, table):
     """Return what is told of a table; columns to choose are right."""
-    for path, told, _ in both_kinds(folder, table):
-        advised = re.findall(r"'([^' ]*,[-+][^']*)'", told)
-        assert bool(advised) == (TWICE in told)
-        for columns in advised:
-            assert len(read_landmarks(path, columns=columns).point_names) == J
+    told, _ = read(path := files.saved(folder / "a.csv", table))
+    advised = re.findall(r"'([^' ]*,[-+][^']*)'", told)
+    assert bool(advised) == (TWICE in told)
+    for columns in advised:
+        assert len(read_landmarks(path, columns=columns).point_names) == J
     return told
 
 
 def quietly_read(folder, table):
     """Return points that are read without any advice."""
-    (_, told, found), (_, typed, same) = both_kinds(folder, table)
-    assert told == typed == ""
-    assert_array_equal(found.points, same.points)
+    told, found = read(files.saved(folder / "a.csv", table))
+    assert told == ""
     return found.points.to_numpy()
 
 
-def points_in(folder, table):
+def points_in(folder, table, suffix=".csv"):
     """Return the points of a table; the options that are told give the same."""
-    first = None
-    for path, told, found in both_kinds(folder, table):
-        assert told
-        first = found.points if first is None else first
-        assert_array_equal(found.points, first)
-        if option := re.search("row_per_point='(.*?)'", told):
-            again = read(path, row_per_point=option[1])[1]
-            pd.testing.assert_frame_equal(again.points, found.points)
-            pd.testing.assert_frame_equal(again.frames, found.frames)
-        if left := re.search("the columns (.*) are no points", told):
-            every = re.search("columns='(.*)'", told)[1]
-            more = len(read_landmarks(path, columns=every).point_names) - J
-            assert 2 * more == len([n for n in left[1].split(", ") if n[-1] != "z"])
-    return first.to_numpy()
+    told, found = read(path := files.saved(folder / f"a{suffix}", table))
+    assert told
+    if option := re.search("row_per_point='(.*?)'", told):
+        again = read(path, row_per_point=option[1])[1]
+        pd.testing.assert_frame_equal(again.points, found.points)
+        pd.testing.assert_frame_equal(again.frames, found.frames)
+    if left := re.search("the columns (.*) are no points", told):
+        every = re.search("columns='(.*)'", told)[1]
+        more = len(read_landmarks(path, columns=every).point_names) - J
+        assert 2 * more == len([n for n in left[1].split(", ") if n[-1] != "z"])
+    return found.points.to_numpy()
 
 
 def test_other_columns_of_a_row_for_each_point():
@@ -150,7 +139,7 @@ FACES = ARRAY.data.reshape(60, 68, 2)
 PIXELS = 300 + 400 * FACES
 THIRD = np.sin(np.arange(60 * 68)).reshape(60, 68, 1) * FACES.std()
 SEEN = 0.95 + 0.05 * np.cos(np.arange(60 * 68)).reshape(60, 68, 1)
-COLUMNS = FACES.reshape(60, -1)
+COLUMNS = FACES[:, ::2].reshape(60, -1)
 CENTRED = COLUMNS - COLUMNS.mean(axis=0)
 RANGE = (COLUMNS - COLUMNS.min(axis=0)) / np.ptp(COLUMNS, axis=0)
 LOW, HIGH = np.percentile(COLUMNS, [25, 75], axis=0)
@@ -158,31 +147,31 @@ LOW, HIGH = np.percentile(COLUMNS, [25, 75], axis=0)
 
 def told_of_fit_to(table):
     """Return what a fit warns of."""
-    with warnings.catch_warnings(record=True, action="always") as caught:
-        AffineNRSfM(1, refinement=None, random_state=0).fit(table)
-    return [str(each.message) for each in caught]
+    model = AffineNRSfM(1, isa=FastISA(n_init=1), refinement=None, random_state=0)
+    return warnings_of(model.fit, table)[0]
 
 
 def told_of_columns(folder, table):
     """Return whether fit and reader tell that columns were scaled separately."""
-    path = files.saved(folder / "a.csv", wide("{axis}{part}", table, range(68)))
-    texts = " ".join(told_of_fit_to(table)), read(path)[0]
+    path = files.saved(folder / "a.csv", wide("{axis}{part}", table, range(34)))
+    texts = told_of_fit_to(table), read(path)[0]
     return ["Each column was scaled separately" in text for text in texts]
 
 
-FURTHER = [[THIRD], [SEEN], [0 * SEEN], [THIRD, SEEN], [THIRD, 0 * SEEN]]
+FURTHER = [[], [THIRD], [SEEN], [0 * SEEN], [THIRD, SEEN], [THIRD, 0 * SEEN]]
 
 
 @pytest.mark.parametrize("further", FURTHER)
 @pytest.mark.parametrize("tracks", [FACES, PIXELS])
 @pytest.mark.filterwarnings("ignore:(in 1 of|68 of 136)")
-def test_points_of_three_or_four_numbers(tracks, further):
+def test_points_of_two_to_four_numbers(tracks, further):
     n = 2 + len(further)
     X = np.concatenate([tracks, *further], axis=2)
     for layout in ("interleaved", "planar"):
         fit = AffineNRSfM(1, layout=layout, refinement=None).fit
-        cases = {"the shape": X}
-        cases[f"{n} numbers for each point"] = pd.DataFrame(table_of(X, layout))
+        cases = {r"the shape \(60, 68": X, rf"the shape \(60, {n}": X.swapaxes(1, 2)}
+        if n > 2:
+            cases[f"{n} numbers for each point"] = pd.DataFrame(table_of(X, layout))
         if n == 3:
             cases["an even number"] = pd.DataFrame(table_of(X[:, :21], layout))
         for told, given in cases.items():
@@ -200,13 +189,12 @@ def test_two_rows_of_points_are_no_visibilities():
     AffineNRSfM(1, refinement=None).fit(X)
 
 
-@pytest.mark.parametrize("still", [2, 3, 30])
+@pytest.mark.parametrize("still", [2, 30])
 def test_points_that_stand_still(still):
     walk = 30 * np.cumsum(np.random.default_rng(0).normal(size=(60, 1, 2)), axis=0)
     X = FACES + walk
     X[:, -still:] = FACES[:1, -still:] + 0.01 * FACES[:, -still:]
-    (told,) = (text for text in told_of_fit_to(table_of(X)) if "stand still" in text)
-    assert told.startswith(f"{still} ")
+    assert re.search(rf"\b{still} [\w ]*stand still", told_of_fit_to(table_of(X)))
 
 
 SCORES = np.linspace(0.02, 0.4, N * J).reshape(N, J)
@@ -270,13 +258,6 @@ def test_failed_frames_of_the_first_openface(tmp_path):
     table = wide("{axis}_{part}", files.scene(N, 68), range(68))  # parts of a table
     path = files.saved(tmp_path / name, table.assign(success=np.arange(N) % 2))
     assert list(read_landmarks(path).failed) == [True, False] * (N // 2)
-
-
-@pytest.mark.parametrize("names", [["a.jpg"], ["a.jpg", "happy"]])
-def test_a_first_line_of_numbers_is_no_header(tmp_path, names):
-    table = pd.DataFrame([[*names, *row] for row in FLAT])
-    path = files.saved(tmp_path / "a.csv", table, header=False)
-    assert "its first line has numbers" in read(path)[0]
 
 
 test_refusals = refusals_of("other_shapes", globals())

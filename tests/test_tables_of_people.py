@@ -4,22 +4,19 @@ import contextlib
 import gzip
 import re
 import warnings
+from functools import partial
 
 import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import fit, write_landmarks
+from fit_runs import QUICK, ran, told_of_fit
 from landmark_files import saved, scene
+from made_once import made_once
 from refusals import refusals_of, refused, warned
-from scenes import table_of
-from sklearn.base import clone
 
-from isa_nrsfm import AffineNRSfM, FastISA
+from isa_nrsfm import AffineNRSfM, FastISA, analysis
 from isa_nrsfm.baselines import PseudoInverseNRSfM
-from isa_nrsfm.cli._columns import asked_columns
-from isa_nrsfm.cli._options import build_parser
-from isa_nrsfm.cli._reading import image_numbers, read_frames
 from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.io import landmark_table, open_table, read_landmarks, read_table
 from isa_nrsfm.skeletons import read_skeleton
@@ -28,51 +25,68 @@ N = 24
 POINTS = [f"{axis}{j}" for j in range(12) for axis in "xy"]
 
 
+@made_once
 def landmarks(n_frames=N):
     scene = make_nonrigid_tracks(n_frames, 12, 1, noise=0.01, random_state=0)
     return pd.DataFrame(scene.data, columns=POINTS)
 
 
-def read_by_fit(path, *options):
-    """Read a table as the command fit does, without a fit: options and frames."""
-    argv = ["fit", path, "-o", "out", *options]
-    args = build_parser().parse_args([str(word) for word in argv])
-    return args, read_frames(args)
-
-
-def asked_in(folder, columns, *options, suffix=".csv", **written):
-    """Read a table with some columns as the command fit does, without a fit."""
+def table_beside(folder, columns, suffix=".csv", **written):
+    """Return the path of a table with further columns."""
     columns = pd.DataFrame(columns)
     table = pd.concat([landmarks(len(columns)), columns], axis=1)
-    path = saved(folder / f"table{suffix}", table, **written)
-    return asked_columns(*read_by_fit(path, *options))
+    return saved(folder / f"table{suffix}", table, **written)
 
 
-def seconds(times):
-    times = np.asarray(times)
-    if times.dtype.kind == "M":
-        return (times - times[0]) / np.timedelta64(1, "s")
-    return times - times[0]
+def handed(owner, name, path, *options):
+    """Run the command fit up to a call of a function: its arguments, what is told."""
+    calls = []
+
+    def stop(*args, **kwargs):
+        calls.append((args, kwargs))
+        raise ValueError("here it is called")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(owner, name, stop)
+        _, _, told = ran("fit", path, "-o", path.parent / "o", *QUICK, "1", *options)
+    told, last = told[:-1].rpartition("\n")[::2]
+    assert last == "isa-nrsfm: error: here it is called"
+    return *calls[0], told
+
+
+def times_of(folder, columns, *options, suffix=".csv"):
+    """Return the seconds since the first frame, as frames with a label have them."""
+    columns = pd.DataFrame(columns).assign(mood=ROWS % 3)
+    path = table_beside(folder, columns, suffix)
+    found = handed(analysis, "association", path, "--label", "mood", *options)[1]
+    times = found["time"] - found["time"][0]
+    unit = np.timedelta64(1, "s") if times.dtype.kind == "m" else 1
+    return np.round(times / unit, 6)
 
 
 DAY = 86400.0
 
 
-def times_in(folder, cells):
-    """Return the times of some cells, in seconds.
-
-    The time of a column is that of its rows: short ones are repeated by groups.
-    """
-    n_groups = -(-N // len(cells))
-    columns = {"t": cells * n_groups, "g": np.repeat(range(n_groups), len(cells))}
-    found = asked_in(folder, columns, "--time", "t", "--group", "g").times
-    return [*np.round(seconds(found)[: len(cells)], 6)]
+def times_in(folder, cells, *options):
+    """Return the times of some cells, which are repeated by groups."""
+    columns = {"t": np.resize(cells, N), "g": ROWS // len(cells)}
+    options = "--time", "t", "--group", "g", *options
+    return times_of(folder, columns, *options)[: len(cells)]
 
 
-def steps_of(folder, cell, *options):
-    """Return the times of twelve cells, in seconds from the first one."""
-    cells = {"t": [cell.format(i) for i in range(1, 13)]}
-    return seconds(asked_in(folder, cells, *options).times)
+def labels_in(folder, columns, name):
+    """Return the labels of a table with typed columns."""
+    path = table_beside(folder, columns, ".parquet")
+    return handed(analysis, "association", path, "--label", name)[1]["y"]
+
+
+def refused_beside(folder, columns, options):
+    """Raise what is told of further columns, as a fit with these options does."""
+    told_of_fit(table_beside(folder, columns), " ".join([*QUICK, "1", options]))
+
+
+def cells_of(cell):
+    return {"t": [cell.format(i) for i in range(1, 13)]}
 
 
 DAYS = [f"{i}/03/2024" for i in range(8, N + 7)]
@@ -81,51 +95,46 @@ ROWS = np.arange(N)
 FACES = {"face": np.where(ROWS % 2, "right", "left")}
 
 
-def images_of(folder, columns, options):
-    """Return the numbers of images that --fps counts."""
+def images_of(folder, columns, options=""):
+    """Return the numbers of images that --fps counts, from 0 on."""
     columns = pd.DataFrame(columns, index=ROWS)
-    times = asked_in(folder, columns, "--fps", 25, *options).times
-    return np.round(25 * seconds(times), 9)
+    times = times_of(folder, columns, "--fps", 25, *options.split())
+    return np.round(25 * times, 6)
 
 
-def numbers_in(names):
-    """Return the numbers of frames in names of images."""
-    return list(image_numbers(pd.DataFrame({"image": names.split()})))
+def numbers_in(folder, names, n_groups=1):
+    """Return the numbers of frames in names of images, from 0 on."""
+    names = names.split()
+    columns = {"image": np.resize(names, N), "g": ROWS * n_groups // len(names)}
+    return list(images_of(folder, columns, "--group g")[: len(names)])
 
 
-def names_in(folder, *names):
-    """Return the classes and groups of a column with these names."""
-    options = "--label", "who:classes", "--group", "who"
-    found = asked_in(folder, {"who": np.resize(names, N)}, *options)
-    assert {*found.labels[0].values} == {*found.groups}
-    return sorted({*found.groups})
+# Names of classes in their order, and words for missing cells
+CLASSES = [("007", "7"), ("100000", "1e5"), ("1.1", "1.10"), ("none", "round")]
+CLASSES += [("8", "9", "10"), ("123456789012345678901", "123456789012345678902")]
+MISSING = ["NULL", "n/a", "", " ", "<NA>", "NA"]
 
 
-def classes_in(folder, *cells):
-    """Return the classes of a column, in their order."""
-    found = asked_in(folder, {"who": np.resize(cells, N)}, "--label", "who")
-    return [str(name) for name in found.labels[0].cat.categories]
+def refuse(*args, **kwargs):
+    raise ValueError("too few frames")
 
 
-TYPED = {"day": pd.to_datetime(["2024-02-01", "2024-02-02"] * (N // 2))}
-TYPED |= {"mood": ["1", "b"] * (N // 2), "ok": [True, False] * (N // 2)}
-
-
-def labels_with(folder, word, *options, suffix=".csv"):
-    """Return labels of which row 4 has a word for missing."""
-    mood, age = np.where(ROWS % 3, "up", "down"), (20.5 + ROWS).astype(str)
-    columns = pd.DataFrame({"mood": mood, "age": age}, dtype=object)
-    columns.loc[4] = word
-    return asked_in(folder, columns, *options, suffix=suffix).labels
-
-
-def missing_in(folder, word, suffix=".csv"):
-    """Return the rows that lack a class and a number."""
-    labels = "--label", "mood", "--label", "age"
-    mood, age = labels_with(folder, word, *labels, suffix=suffix)
-    assert set(mood.dropna()) == {"up", "down"}
-    assert age.dtype == float
-    return [list(np.flatnonzero(label.isna())) for label in (mood, age)]
+def test_labels_are_as_they_are_written(tmp_path, fits, monkeypatch):
+    quickly = partial(analysis.association, n_permutations=9)
+    monkeypatch.setattr(analysis, "association", quickly)
+    monkeypatch.setattr(analysis, "predictability", refuse)
+    columns = {f"with {names[0]}": np.resize(names, N) for names in CLASSES}
+    options = [f"{name}:classes" if "." in name else name for name in columns]
+    expected = [("classes", [*names], 0) for names in CLASSES]
+    mood, age = np.resize(["down", "up"], N), 20.5 + ROWS
+    columns |= {"mood": [*MISSING, *mood[6:]], "age": [*MISSING, *age[6:]]}
+    options += ["mood", "age"]
+    expected += [("classes", ["down", "up"], 6), ("number", [], 6)]
+    path = table_beside(tmp_path, columns)
+    options = [word for name in options for word in ("--label", name)]
+    labels = fits(path, *QUICK, "1", *options).report["labels"]
+    found = [(e["kind"], [*e.get("classes", ())], e["n_without_label"]) for e in labels]
+    assert found == expected
 
 
 def test_texts_of_tables_are_no_mathematics():
@@ -143,44 +152,32 @@ def test_texts_of_tables_are_no_mathematics():
 
 def test_files_of_a_folder_are_in_the_order_of_their_numbers(tmp_path):
     names = [f"frame{i}" for i in (0, 1, 2, 9, 10, 11, 100)] + ["frame100b2", "g"]
-    for i, name in enumerate(reversed(names)):
-        points = np.full((8, 2), float(len(names) - i))
-        lines = [
-            "version: 1",
-            "n_points: 8",
-            "{",
-            *(f"{x} {y}" for x, y in points),
-            "}",
-        ]
+    (tmp_path / "parquet").mkdir()
+    for i, name in reversed([*enumerate(names, 1)]):
+        lines = ["version: 1", "n_points: 8", "{", *[f"{i} {i}"] * 8, "}"]
         files.write_text(tmp_path / "pts" / f"{name}.pts", *lines)
-        for kind in ("npy", "parquet"):
-            (tmp_path / kind).mkdir(exist_ok=True)
-        np.save(tmp_path / "npy" / f"{name}.npy", points.reshape(1, -1))
-        table = pd.DataFrame(points.reshape(1, -1), columns=POINTS[:16])
-        saved(tmp_path / "parquet" / f"{name}.parquet", table)
-    order = 1 + np.arange(len(names))
+        row = pd.DataFrame(np.full((1, 16), i), columns=POINTS[:16])
+        saved(tmp_path / "parquet" / f"{name}.parquet", row)
     found = read_landmarks(tmp_path / "pts")
     assert list(found.frames["file"]) == [f"{name}.pts" for name in names]
-    np.testing.assert_array_equal(found.points["x_0"], order)
-    for kind in ("npy", "parquet"):
-        np.testing.assert_array_equal(open_table(tmp_path / kind)[:][:, 0], order)
+    for points in (found.points.to_numpy(), open_table(tmp_path / "parquet")[:]):
+        np.testing.assert_array_equal(points[:, 0], 1 + np.arange(len(names)))
 
 
 def tracks_read(folder, tracks, *options):
-    """Read tracks as the command fit does; return points and texts of warnings."""
+    """Read tracks as the command fit does; return points, and what is told."""
     table = pd.DataFrame(tracks.reshape(len(tracks), -1), columns=POINTS)
     path = saved(folder / "table.csv", table)
-    with warnings.catch_warnings(record=True, action="always") as caught:
-        _, frames = read_by_fit(path, *options)
-    return frames.points.to_numpy(), [str(each.message) for each in caught]
+    (_, X), _, told = handed(AffineNRSfM, "fit", path, *options)
+    told = [line.removeprefix("isa-nrsfm: warning: ") for line in told.splitlines()]
+    return X.to_numpy(), told
 
 
 @pytest.mark.parametrize(("code", "digits"), [(-1.0, 0), (999.0, 3), (0.0, 3)])
 def test_codes_of_missing_points_cause_a_warning(tmp_path, code, digits):
     tracks = landmarks(200).to_numpy().reshape(200, -1, 2)
     tracks = (500 + 40 * tracks).round(digits)
-    _, texts = tracks_read(tmp_path, tracks)
-    assert texts == []
+    assert tracks_read(tmp_path, tracks)[1] == []
     hidden = np.random.default_rng(0).random(tracks.shape[:2]) < 0.1
     hidden[:, :8] = False  # these are seen in all rows
     tracks[hidden] = code
@@ -196,15 +193,11 @@ def test_codes_of_missing_points_cause_a_warning(tmp_path, code, digits):
     np.testing.assert_array_equal(points.reshape(tracks.shape), tracks)
     shown = f"in {n_rows} of 200 rows points are at exactly ({code:g}, {code:g})"
     assert warning.startswith(f"{shown} ({n_points} in all)")
-    warned(re.escape(warning.partition(" If")[0]), PAPER.fit, points)
     expected = np.where(hidden[..., None], np.nan, tracks).reshape(200, -1)
-    table = pd.DataFrame(points, columns=POINTS)
-    found = landmark_table(table, missing=code).points
-    np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
-    number = re.search(r"with missing=(\S+)", warning)[1]
-    points, texts = tracks_read(tmp_path, tracks, f"--missing-value={number}")
+    option = re.search(r"with (--missing-value)[ =](\S+)", warning).groups()
+    points, told = tracks_read(tmp_path, tracks, "=".join(option))
     np.testing.assert_array_equal(points, expected)
-    assert texts == []
+    assert told == []
 
 
 def test_pixels_of_a_face_that_hardly_moves_are_no_code(tmp_path):
@@ -229,25 +222,22 @@ def test_several_codes_are_missing_together(tmp_path):
 
 
 @pytest.mark.slow
-def test_files_of_other_programs_are_not_replaced(tmp_path, capsys):
-    path, folder = tmp_path / "table.csv", tmp_path / "out"
-    write_landmarks(path)
-    files.write_text(folder / "notes.txt", "mine")
-    assert fit(path, folder, 0, "--no-figures") == 0  # other names are no matter
-    assert fit(path, folder, 0) == 0  # figures are new
-    assert (folder / "notes.txt").read_text() == "mine\n"
-    for name in ("cameras.csv", "report.html", "report.json", "basis_shapes.png"):
-        capsys.readouterr()
-        other = tmp_path / f"of {name}"
-        files.write_text(other / name, text := '{"sha256": {}, "mine": [1]}')
-        options = [] if name.endswith("png") else ["--no-figures"]
-        assert fit(path, other, 0, *options) == 1
-        told = f"would be replaced: .*/{name}. Choose another --output, or .* --force"
-        assert re.search(told, capsys.readouterr().err)
-        assert [file.name for file in other.iterdir()] == [name]
-        assert (other / name).read_text() == f"{text}\n"
-        assert fit(path, other, 0, *options, "--force") == 0
-        assert fit(path, other, 0, *options) == 0
+@pytest.mark.parametrize("name", ["cameras.csv", "report.json", "basis_shapes.png"])
+def test_files_of_other_programs_are_not_replaced(tmp_path, succeeds, fails, name):
+    path, text = saved(tmp_path / "a.csv", landmarks()), '{"sha256": {}, "mine": [1]}'
+    notes = files.write_text(tmp_path / "o" / "notes.txt", "mine")
+    theirs = files.write_text(tmp_path / "o" / name, text)
+    argv = ["fit", path, "-o", tmp_path / "o", *QUICK, "1"]
+    if name.endswith("png"):
+        argv.remove("--no-figures")
+    told = f"would be replaced: .*/{name}. Choose another --output, or .* --force"
+    assert re.search(told, fails(*argv))
+    assert {*notes.parent.iterdir()} == {notes, theirs}
+    assert theirs.read_text() == f"{text}\n"
+    for options in (["--force"], []):
+        succeeds(*argv, *options)
+        assert theirs.read_text(errors="replace") != f"{text}\n"
+    assert notes.read_text() == "mine\n"
 
 
 def named_as_others(estimator, **further):
@@ -270,39 +260,17 @@ QUICKLY = {"n_components": 1, "isa": FastISA(n_init=1), "random_state": 0}
 PAPER, BASELINE = AffineNRSfM(**QUICKLY, refinement=None), PseudoInverseNRSfM(1)
 
 
-@pytest.mark.parametrize("estimator", [PAPER, BASELINE])
-@pytest.mark.parametrize("layout", ["interleaved", "planar"])
-def test_the_error_of_tracks_makes_them_a_table(estimator, layout):
-    tracks = landmarks().to_numpy().reshape(N, 12, 2)
-    estimator = clone(estimator).set_params(layout=layout)
-    for X in (tracks, tracks.swapaxes(1, 2)):
-        told = str(refused(r"reshape\(len\(X\), -1\)", estimator.fit, X))
-        way = told.rpartition("give ")[2]
-        table = eval(way, {"X": X, "np": np})
-        np.testing.assert_array_equal(table, table_of(tracks, layout))
-    for X in (tracks[None], np.zeros((30, 12, 5))):
-        refused(r"one row per frame .* got the shape .*\)$", estimator.fit, X)
-
-
-@pytest.mark.parametrize(
-    ("suffix", "typed"), [(".csv", True), (".parquet", True), (".parquet", False)]
-)
-def test_frames_without_a_face_are_left_out_of_each_kind_of_file(
-    tmp_path, suffix, typed
-):
+def test_frames_without_a_face_are_left_out_of_tables_of_texts(tmp_path):
     success = np.minimum(np.arange(12) % 3, 1)
     path = files.write_openface(tmp_path / "a.csv", scene(), success=success)
     others = {"subject": "007", "age": 30, "mood": "NA"}
-    table = pd.read_csv(path).copy().assign(**others)
-    path = saved(path.with_suffix(suffix), table if typed else table.astype(str))
+    table = pd.read_csv(path).copy().assign(**others).astype(str)
+    path = saved(path.with_suffix(".parquet"), table)
     found = read_landmarks(path)
     assert found.format == "openface"
     np.testing.assert_array_equal(found.failed, np.arange(12) % 3 == 0)
     assert set(found.frames["subject"]) == {"007"}
     assert set(found.frames["age"]) == {30}
-    _, frames = read_by_fit(path)
-    assert [each["reason"] for each in frames.left_out] == ["tracking failed"]
-    assert len(frames.X) == 8
 
 
 def test_skeletons_are_read_in_bounded_time(tmp_path):
@@ -366,16 +334,12 @@ def test_tables_with_other_separators_are_read(tmp_path):
 @pytest.mark.parametrize("decimal", [",", "."])
 @pytest.mark.filterwarnings("ignore:(the cells of|numbers have)")
 def test_other_columns_of_tables_with_other_separators(tmp_path, decimal):
-    columns, written = {"age": ROWS % 7 + 0.5, "t": 0.04 * ROWS}, {"decimal": decimal}
+    columns = {"age": ROWS % 7 + 0.5, "t": 0.04 * ROWS}
+    path = table_beside(tmp_path, columns, sep=";", decimal=decimal)
     options = "--label", "age", "--time", "t"
-    found = asked_in(tmp_path, columns, *options, sep=";", **written)
-    np.testing.assert_array_equal(found.labels[0], columns["age"])
-    np.testing.assert_array_equal(found.times, columns["t"])
-
-
-def test_the_way_from_several_levels_of_names_is_right():
-    table = followed(landmark_table, LEVELS, table=LEVELS.copy())["table"]
-    np.testing.assert_array_equal(landmark_table(table).points, WIDE)
+    (_,), found, _ = handed(analysis, "association", path, *options)
+    np.testing.assert_array_equal(found["y"], columns["age"])
+    np.testing.assert_array_equal(found["time"], columns["t"])
 
 
 def pattern_told(name):
@@ -390,13 +354,10 @@ def pattern_told(name):
     return pattern
 
 
+WORDS = ["NaN", "NAN", "Na", "#N/A", "<NA>", "-nan", "-nan(ind)", "None", '""']
 HOLED = WIDE.copy()
-HOLED.iloc[1, 4:6] = np.nan
-
-
-def with_word(word):
-    """Return the text of a table with a word for missing numbers."""
-    return HOLED.to_csv(index=False, na_rep="@").replace("@", word)
+HOLED.iloc[1, : len(WORDS)] = np.nan
+HOLES = HOLED.to_csv(index=False, na_rep="{}").format(*WORDS)
 
 
 def skeletons(text):
