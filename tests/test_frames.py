@@ -16,35 +16,25 @@ from frame_parts import (
     fit_posterior,
     numbers_of,
 )
-from layers import slow_after
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal, assert_array_less
 from refusals import refusals_of
-from scenes import images, random_rotation, with_gaps
+from scenes import images, random_cameras, random_rotation, with_gaps
 from scipy.optimize import minimize
-from scipy.spatial.transform import Rotation
 
-from isa_nrsfm import AffineNRSfM
 from isa_nrsfm._frames.camera_models import (
     CAMERAS,
-    full_rotations,
-    mean_view,
-    nearest_calibrated,
 )
-from isa_nrsfm._frames.models import spread_starts  # noqa: F401  in refusals.txt
+from isa_nrsfm._frames.models import spread_starts
 from isa_nrsfm._frames.search import (
     FrameSearch,
-    calibrated_starts,
     frame_sums,
     frame_tracks,
 )
-from isa_nrsfm._linalg import COLUMNS, ROWS, frames_first, frames_last, unpacked
+from isa_nrsfm._linalg import frames_last, unpacked
 from isa_nrsfm._tables import block_slices  # noqa: F401  in refusals.txt
 
-AS_USERS = ["few_frames", "widths"]
 NOISE = 0.02
 CAMERA = pytest.mark.parametrize("camera", CAMERAS)
-CALIBRATED = pytest.mark.parametrize("camera", ["weak_perspective", "orthographic"])
-GAPS = pytest.mark.parametrize("gaps", [False, True])
 KINDS = pytest.mark.parametrize("kind", ["complete", "gaps", "weighted"])
 
 
@@ -103,7 +93,7 @@ def hessian_of(f, n, h=1e-3):
 @CAMERA
 class TestMinimum:
     def test_objective_rises_in_every_direction(self, camera, kind):
-        scene = scene_of(camera, kind)
+        scene = scene_of(camera, kind, n_frames=8)
         fits = fitted(scene, camera)
         if camera != "affine":
             assert_calibrated(fits.motion, camera)
@@ -129,7 +119,7 @@ class TestMinimum:
         self, camera, kind
     ):
         deviation = 2e-3
-        scene = scene_of(camera, kind, noise=deviation, n_frames=4)
+        scene = scene_of(camera, kind, noise=deviation, n_frames=2)
         noise, n = deviation**2, CAMERAS[camera].n_parameters
         fits = fitted(scene, camera, noise)
         for i, M in enumerate(fits.motion):
@@ -147,29 +137,36 @@ class TestMinimum:
                 assert_allclose(got, part, atol=2e-3 * np.abs(part).max())
         assert np.isnan(fits.turn_covariance).all() == (camera == "affine")
 
-    @pytest.mark.parametrize("depth", slow_after(1, [0.1, 1.0]))
-    def test_is_no_higher_than_from_many_other_starts(self, camera, kind, depth):
-        scene = scene_of(camera, kind, noise=0.1, n_frames=1, depth=depth)
-        noise = 0.1**2
-        fits = fitted(scene, camera, noise)
-        rng = np.random.default_rng(1)
-        for i, M in enumerate(fits.motion):
-            scale = np.linalg.norm(M) / np.sqrt(2)
-            found, ends = value(scene, i, M, noise), []
-            for _ in range(6):
-                start = scale * Rotation.random(None, rng).as_matrix()[:2]
-                ends.append(self.minimum(scene, camera, i, start, noise))
-            assert found <= min(ends) + 1e-6
-            assert min(ends) == pytest.approx(found, abs=1e-4)
 
-    @staticmethod
-    def minimum(scene, camera, i, start, noise):
-        """Return the least objective of a frame that a search from a camera reaches."""
+def reversed_cameras(scene):
+    """Return cameras reflected at the plane of the mean shape."""
+    axes = np.linalg.svd(scene.shapes[0], full_matrices=False)[0]
+    return scene.motion @ axes @ np.diag([1.0, 1.0, -1.0]) @ axes.T
 
-        def f(step):
-            return value(scene, i, moved(camera, start, step), noise)
 
-        return minimize(f, np.zeros(CAMERAS[camera].n_parameters)).fun
+@CAMERA
+def test_the_minimum_is_no_higher_than_from_other_starts(camera):
+    # The depth of the object is that of the noise: the start can be reversed.
+    scene, noise = scene_of(camera, "weighted", 0.05, n_frames=6, depth=0.1), 0.05**2
+    fits = fitted(scene, camera, noise)
+    random_ones = random_cameras(np.random.default_rng(1), 6)
+    random_ones *= np.linalg.norm(fits.motion, axis=(1, 2))[:, None, None] / np.sqrt(2)
+    reversed_ones = reversed_cameras(scene._replace(motion=fits.motion))
+    starts = np.stack([reversed_ones, random_ones, scene.motion], axis=1)
+    found, least = [], []
+    for i, M in enumerate(fits.motion):
+        ends = []
+        for start in starts[i]:
+
+            def end(step, i=i, start=start):
+                return value(scene, i, moved(camera, start, step), noise)
+
+            ends.append(minimize(end, np.zeros(CAMERAS[camera].n_parameters)).fun)
+        found.append(value(scene, i, M, noise))
+        least.append(min(ends))
+    assert_array_less(found, np.array(least) + 1e-6)
+    # Most of these searches end at the minimum.
+    assert np.isclose(found, least, rtol=0, atol=1e-4).sum() >= 4
 
 
 def half_hessian(search, problem, M, size=1e-5):
@@ -188,111 +185,45 @@ def half_hessian(search, problem, M, size=1e-5):
     return 0.5 * (hessian + hessian.swapaxes(0, 1))
 
 
+@KINDS
 @CAMERA
-class TestDerivatives:
-    """Away from the minimum, where the gradient is not zero."""
-
-    @KINDS
-    def test_value_and_hessian_are_exact_but_for_the_determinant(self, camera, kind):
-        # What is left falls like the noise.
-        scene, errors = scene_of(camera, kind), []
-        for noise in (1e-2, 1e-3, 1e-4):
-            search, problem, M = problem_of(scene, camera, noise)
-            values = [
-                value(scene, i, each, noise) for i, each in enumerate(scene.motion)
-            ]
-            found = search.evaluate(problem, M).value
-            assert_allclose(found, noise * np.array(values), rtol=1e-9)
-            M = disturbed(M, camera, 0.03)
-            found = unpacked(search.evaluate(problem, M).hessian)
-            expected = half_hessian(search, problem, M)
-            size = np.abs(expected).max(axis=(0, 1))
-            errors.append((np.abs(found - expected).max(axis=(0, 1)) / size).max())
-        assert errors[0] < 0.1
-        assert errors[1] < 0.15 * errors[0]
-        assert errors[2] < 0.15 * errors[1]
-
-    @pytest.mark.parametrize("noise", [1e-3, 0.1, 10.0])
-    def test_hessian_of_the_determinant_is_a_bound(self, camera, noise):
-        search, problem, M = problem_of(scene_of(camera), camera, noise)
-        M = disturbed(M, camera, 0.1)
+def test_value_and_hessian_are_exact_but_for_the_determinant(camera, kind):
+    # Away from the minimum. What is left falls like the noise.
+    scene, errors = scene_of(camera, kind), []
+    for noise in (1e-2, 1e-3, 1e-4):
+        search, problem, M = problem_of(scene, camera, noise)
+        values = [value(scene, i, each, noise) for i, each in enumerate(scene.motion)]
+        found = search.evaluate(problem, M).value
+        assert_allclose(found, noise * np.array(values), rtol=1e-9)
+        M = disturbed(M, camera, 0.03)
         found = unpacked(search.evaluate(problem, M).hessian)
-        excess = found - half_hessian(search, problem, M)
-        assert (np.linalg.eigvalsh(frames_first(excess))[:, 0] > -1e-5).all()
-        assert np.abs(excess).max() > 1e-5
+        expected = half_hessian(search, problem, M)
+        size = np.abs(expected).max(axis=(0, 1))
+        errors.append((np.abs(found - expected).max(axis=(0, 1)) / size).max())
+    assert errors[0] < 0.1
+    assert errors[1] < 0.15 * errors[0]
+    assert errors[2] < 0.15 * errors[1]
 
 
-@CALIBRATED
-class TestCameraModel:
-    @pytest.mark.parametrize("rank", [0, 1, 2, 4])
-    def test_inverse_curvature_is_that_along_the_tangents(self, camera, rank, rng):
-        model, factors = CAMERAS[camera], rng.normal(size=(20, 3, rank))
-        M, A = frames_last(scene_of(camera).motion), factors @ factors.mT
-        D = model.tangents(M)
-        expected = np.einsum("crai,iab,drbi->icd", D, A, D)
-        inverse = model.inverse_curvature(M, A[:, ROWS, COLUMNS].T).T
-        assert_allclose(inverse, inverse.mT, rtol=1e-12)
-        if rank == 4:
-            assert_allclose(inverse, np.linalg.inv(expected), rtol=1e-5, atol=1e-8)
-        # Of flat shapes, a step along it never goes uphill.
-        least = np.linalg.eigvalsh(inverse)[:, 0]
-        assert (least >= -1e-6 * np.abs(inverse).max(axis=(1, 2))).all()
-
-    def test_no_camera_turns_by_more_than_a_radian_or_scales_by_more(self, camera, rng):
-        model = CAMERAS[camera]
-        step = rng.normal(size=(model.n_parameters, 20))
-        step[3:] = 0.0
-        longest = model.largest_length(step)
-        assert np.linalg.norm(longest * step[:3], axis=0).max() == pytest.approx(1)
-        step[3:], step[:3] = 100.0, 0.0
-        expected = 0.01 if model.scaled else np.inf
-        assert model.largest_length(step) == pytest.approx(expected)
-
-
-def test_cameras_of_zero_have_no_scale():
-    zero = np.zeros((1, 2, 3))
-    rows, scales = nearest_calibrated(zero)
-    assert_allclose(rows @ rows.mT, [np.eye(2)], atol=1e-14)
-    assert_array_equal(scales, [0.0])
-    for start in calibrated_starts(CAMERAS["orthographic"], frames_last(zero)):
-        assert_calibrated(frames_first(start), "orthographic")
-    weak = CAMERAS["weak_perspective"]
-    assert np.isfinite(weak.inverse_curvature(frames_last(zero), np.ones((6, 1)))).all()
-    assert np.isfinite(full_rotations(zero)[0]).all()
-
-
-@pytest.mark.parametrize("unit", [1e-9, 1e9])
-@pytest.mark.parametrize(("share", "none"), [(0.38, False), (0.42, True)])
-def test_cameras_without_a_common_view(unit, share, none):
-    # Mirrored y in a share p of the frames: the mean of y is 1 - 2 p.
-    motion = np.tile(unit * np.eye(2, 3), (100, 1, 1))
-    motion[: round(100 * share), 1, 1] *= -1
-    assert (mean_view(motion) is None) == none
-
-
-@GAPS
 @CAMERA
-class TestExact:
-    def test_truth_is_found(self, camera, gaps):
-        scene = scene_of(camera, "gaps" if gaps else "complete", noise=0.0)
-        fits = fitted(scene, camera, 0.0)
-        for got, true in zip(
-            camera_and_alpha(fits), camera_and_alpha(scene), strict=True
-        ):
-            assert_allclose(got, true, atol=1e-8)
-        assert_allclose(fits.objective, 0, atol=1e-9)
+def test_truth_is_found_without_noise(camera):
+    scene = scene_of(camera, "gaps", noise=0.0)
+    fits = fitted(scene, camera, 0.0)
+    for got, true in zip(camera_and_alpha(fits), camera_and_alpha(scene), strict=True):
+        assert_allclose(got, true, atol=1e-8)
+    assert_allclose(fits.objective, 0, atol=1e-9)
 
 
 @CAMERA
 class TestInvariance:
     def test_frames_are_separate(self, camera):
-        scene = scene_of(camera)
-        scene.tracks[10:] = with_gaps(scene.tracks[10:])
-        scene.tracks[15, 3:] = np.nan
-        noise = np.geomspace(1e-6, 1.0, 20)
+        scene = scene_of(camera, n_frames=8)
+        scene.tracks[4:] = with_gaps(scene.tracks[4:])
+        scene.tracks[6, 3:] = np.nan
+        noise = np.geomspace(1e-6, 1.0, 8)
         together = fitted(scene, camera, noise)
-        assert np.isnan(together.alpha[15]).all()
-        for i in range(20):
+        assert np.isnan(together.alpha[6]).all()
+        for i in range(8):
             one = scene._replace(tracks=scene.tracks[i : i + 1])
             alone = fitted(one, camera, noise[i])
             for got, expected in zip(alone, together, strict=True):
@@ -305,11 +236,10 @@ class TestInvariance:
         got = fitted(scene._replace(tracks=scene.tracks[often]), camera)
         assert_same_fits(got, fitted(scene, camera).take(often), 1e-10)
 
-    @GAPS
     @pytest.mark.parametrize("unit", [1e-100, 1e100])
-    def test_units(self, camera, gaps, unit):
+    def test_units(self, camera, unit):
         # Of single images, or of the whole table and the shapes
-        scene = scene_of(camera, "gaps" if gaps else "complete")
+        scene = scene_of(camera, "gaps")
         units, shapes = unit ** np.random.default_rng(1).random(20), scene.shapes
         if camera == "orthographic":
             units, shapes = np.full(20, unit), unit * shapes
@@ -324,22 +254,24 @@ class TestInvariance:
         assert_allclose(got.covariance, expected.covariance, atol=1e-9)
 
 
+def test_large_deformation_needs_further_starts():
+    scene = scenes.random_scene(0, 40, noise=NOISE, deformation=2.0)
+    starts = spread_starts(scene.alpha)
+    given = ({}, {"initial": scene.alpha}, {"starts": starts})
+    zero, from_truth, found = (fitted(scene, "affine", **g).objective for g in given)
+    least = np.minimum(zero, from_truth)
+    assert (zero > 1.1 * least).any()
+    assert (found <= np.minimum(zero, 1.001 * least)).all()
+
+
 # What is done to shapes (4, 3, n_points), in place
 SHAPES = {
     "flat mean shape": lambda B: B[0, 2].fill(0),
     "flat": lambda B: B[:, 2].fill(0),
     "on a line": lambda B: B[:, 1:].fill(0),
     "no mean shape": lambda B: B[0].fill(0),
-    "no basis shape": lambda B: B[2].fill(0),
-    "rigid": lambda B: B[1:].fill(0),
-    "a point": lambda B: B.fill(0),
-    "equal basis shapes": lambda B: np.copyto(B[2], B[1]),
     "basis shape that a camera makes": lambda B: np.copyto(
         B[1], np.diag([1.0, 2.0, 3.0]) @ B[0]
-    ),
-    "basis shape that a scale makes": lambda B: np.copyto(B[1], 0.5 * B[0]),
-    "basis shape that a turn makes": lambda B: np.copyto(
-        B[1], np.array([[0, -0.2, 0], [0.2, 0, 0], [0, 0, 0]]) @ B[0]
     ),
     "huge basis shapes": lambda B: np.multiply(B[1:], 1e6, out=B[1:]),
     "tiny basis shapes": lambda B: np.multiply(B[1:], 1e-9, out=B[1:]),
@@ -349,15 +281,13 @@ SHAPES = {
 @CAMERA
 class TestDegenerate:
     @pytest.mark.parametrize("kind", SHAPES)
-    @pytest.mark.parametrize("variance", slow_after(1, [0.0, NOISE**2]))
-    def test_stays_finite_and_no_worse_than_rigid(self, camera, kind, variance):
-        scene = scene_of(camera)
+    def test_stays_finite_and_no_worse_than_rigid(self, camera, kind):
+        scene = scene_of(camera, n_frames=8)
         shapes = scene.shapes.copy()
         SHAPES[kind](shapes)
         shapes = random_rotation(5) @ shapes
-        scene.tracks[10:] = with_gaps(scene.tracks[10:])
-        starts = np.ones((2, 3))
-        fits = fit_posterior(scene.tracks, shapes, variance, camera, starts=starts)
+        scene.tracks[4:] = with_gaps(scene.tracks[4:])
+        fits = fit_posterior(scene.tracks, shapes, 0.0, camera, starts=np.ones((2, 3)))
         for each in numbers_of(fits):
             assert np.isfinite(each).all()
         variances = np.diagonal(fits.covariance, axis1=1, axis2=2)
@@ -396,11 +326,10 @@ class TestDegenerate:
             assert_array_equal(finite.all(axis=1), expected)
             assert_array_equal(finite.any(axis=1), expected)
 
-    @pytest.mark.parametrize("variance", [0.0, NOISE**2])
-    def test_all_points_of_a_frame_equal(self, camera, variance):
+    def test_all_points_of_a_frame_equal(self, camera):
         scene = scene_of(camera, n_frames=3)
         scene.tracks[1] = scene.tracks[1, 0]
-        fits = fitted(scene, camera, variance)
+        fits = fitted(scene, camera, 0.0)
         for each in numbers_of(fits):
             assert np.isfinite(each).all()
         # The centroids are what it shows.
@@ -409,77 +338,6 @@ class TestDegenerate:
         if camera == "affine":
             assert_allclose(fits.motion[1], 0, atol=1e-12)
             assert_allclose(fits.alpha[1], 0, atol=1e-12)
-
-
-def test_flat_shapes_have_cameras_that_are_zero_across():
-    scene = scenes.random_scene(0, noise=NOISE)
-    scene.shapes[:, 2] = 0
-    R = random_rotation(0)
-    for n in (4, 1):
-        fits = fit_posterior(scene.tracks, (R @ scene.shapes)[:n], NOISE**2)
-        assert_allclose(fits.motion @ R[:, 2], 0, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_large_motion_needs_further_starts(load_data):
-    tracks = load_data("akhter_yoga")["W2d"]
-    model = AffineNRSfM(2, random_state=0).fit(tracks.reshape(len(tracks), -1))
-    tracks = tracks - tracks.mean(axis=1, keepdims=True)
-    tracks /= np.sqrt(np.mean(tracks**2, axis=(1, 2), keepdims=True))
-    frames = model._model.frames
-
-    def objective(**given):
-        noise = frames.noise_variance
-        return fit_posterior(tracks, frames.shapes, noise, **given).objective
-
-    starts = np.random.default_rng(0).normal(size=(8, 2))
-    starts[4:] *= 2
-    zero = objective()
-    found = [objective(initial=np.tile(start, (len(tracks), 1))) for start in starts]
-    least = np.min([zero, *found], axis=0)
-    best = objective(starts=frames.starts)
-    assert (best <= zero).all()
-    assert (zero > 1.1 * least).any()
-    assert np.mean(best <= 1.001 * least) >= 0.995
-
-
-@CALIBRATED
-class TestReversal:
-    """Of a nearly flat object, whose reversed images are nearly the same."""
-
-    def scene(self, camera, deviation=0.01):
-        return scene_of(camera, noise=deviation, depth=0.1, n_frames=40)
-
-    def test_cameras_that_start_reversed_are_turned_back(self, camera):
-        scene = self.scene(camera)
-        expected = fitted(scene, camera, 1e-4).motion
-        search, problem, _ = problem_of(scene, camera, 1e-4)
-        found, better = search.reversed_cameras(problem, self.reversed(scene))
-        assert better.mean() > 0.9
-        # A few steps lead there, not all of them to the minimum.
-        away = np.abs(found - expected).max(axis=(1, 2))[better]
-        assert away.max() < 0.2
-        assert np.median(away) < 1e-4
-        assert_calibrated(found, camera)
-        # Those at the minimum stay.
-        found, better = search.reversed_cameras(problem, expected)
-        assert not better.any()
-        assert_array_equal(found, expected)
-
-    def reversed(self, scene):
-        """Return cameras reflected at the plane of the mean shape."""
-        axes = np.linalg.svd(scene.shapes[0], full_matrices=False)[0]
-        return scene.motion @ axes @ np.diag([1.0, 1.0, -1.0]) @ axes.T
-
-    def test_fit_takes_the_better_of_the_two(self, camera):
-        # The depth of the object is that of the noise: the start can be reversed.
-        scene = self.scene(camera, deviation=0.05)
-        noise = 0.05**2
-        fits = fitted(scene, camera, noise)
-        turned = scene._replace(motion=fits.motion)
-        for i, start in enumerate(self.reversed(turned)[:10]):
-            end = TestMinimum.minimum(scene, camera, i, start, noise)
-            assert value(scene, i, fits.motion[i], noise) <= end + 1e-6
 
 
 test_refusals = refusals_of("frames", globals())

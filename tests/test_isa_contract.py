@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 from groupings import GROUPINGS, energy_inside
 from joblib import parallel_config
-from layers import may_not_converge, slow_after, start_may_not_converge
+from layers import may_not_converge, start_may_not_converge
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
@@ -69,7 +69,7 @@ class TestStrategies:
         refused("got rank 5 in n_samples=6 samples", isa.fit, few)
 
     def test_not_converged(self, isa):
-        message = f"{type(isa).__name__} did not converge in max_iter=1 steps"
+        message = f"{type(isa).__name__} did not converge in max_iter=1 steps.*max_iter"
         one_step = clone(isa).set_params(max_iter=1)
         few = spherical_sources(0, 68, 9)
         warned(message, one_step.fit, few, category=ConvergenceWarning)
@@ -159,14 +159,6 @@ class TestOptimality:
         found = isa.log_likelihood_ if kind is FastISA else isa.criteria_.max()
         assert_allclose(found, expected)
 
-    def test_largest_likelihood_is_kept(self):
-        isa = FastISA(n_init=12, random_state=0).fit(FEW)
-        assert isa.log_likelihoods_.shape == isa.n_iters_.shape == (12,)
-        assert np.ptp(isa.log_likelihoods_) > 1e-3
-        best = isa.log_likelihoods_.argmax()
-        assert isa.log_likelihood_ == isa.log_likelihoods_[best]
-        assert isa.n_iter_ == isa.n_iters_[best]
-
     def test_starts_that_agree_are_enough(self):
         signals, _ = mixed(0, n_subspaces=3)
         isa = FastISA(n_init=30, random_state=0).fit(signals)
@@ -174,21 +166,27 @@ class TestOptimality:
 
 
 class TestInvariances:
+    @may_not_converge
     def test_threads_change_no_bit(self):
-        signals, isa = mixed(0, 500)[0], FastISA(n_init=17, random_state=0)
-        one = clone(isa).fit(signals)
+        isa = FastISA(n_init=24, tol=1e-2, random_state=0)  # the last batches at once
+        one = clone(isa).fit(FEW)
+        assert len(one.log_likelihoods_) == 24
         with parallel_config(backend="threading", n_jobs=3):
-            three = isa.fit(signals)
+            three = isa.fit(FEW)
         assert_array_equal(three.components_, one.components_)
         assert_array_equal(three.log_likelihoods_, one.log_likelihoods_)
 
     @may_not_converge
-    def test_fewer_starts_are_the_first_of_more(self):
+    def test_fewer_starts_are_the_first_of_more_and_the_likeliest_is_kept(self):
         given = {"tol": 1e-2, "random_state": 0}
         one, nine, ten = (FastISA(n_init=n, **given).fit(FEW) for n in (1, 9, 10))
-        for fewer, n in ((one, 1), (nine, 9)):
-            assert_array_equal(fewer.log_likelihoods_, ten.log_likelihoods_[:n])
-            assert_array_equal(fewer.n_iters_, ten.n_iters_[:n])
+        for isa, n in ((one, 1), (nine, 9), (ten, 10)):
+            assert_array_equal(isa.log_likelihoods_, ten.log_likelihoods_[:n])
+            assert_array_equal(isa.n_iters_, ten.n_iters_[:n])
+            best = isa.log_likelihoods_.argmax()
+            found = isa.log_likelihood_, isa.n_iter_
+            assert found == (isa.log_likelihoods_[best], isa.n_iters_[best])
+        assert np.ptp(ten.log_likelihoods_) > 1e-3
 
     def test_general_mixing_leaves_the_subspaces(self, rng):
         signals, A = mixed(0, n_subspaces=3)[0], rng.normal(size=(9, 9))
@@ -199,42 +197,20 @@ class TestInvariances:
         assert_allclose(other.log_likelihood_, first.log_likelihood_, atol=1e-8)
 
 
-class TestEdges:
-    @may_not_converge
-    def test_hardly_more_samples_than_signals(self):
-        signals = np.random.default_rng(0).normal(size=(14, 12))
-        isa = FastISA(n_init=2, random_state=0).fit(signals)
-        assert np.isfinite(isa.components_).all()
-
-    def test_not_converged(self):
-        message = "FastISA did not converge in max_iter=1 steps: its best start still "
-        message += "changes. Increase max_iter or tol"
-        isa = FastISA(n_init=2, max_iter=1, random_state=0)
-        warned(message, isa.fit, FEW, category=ConvergenceWarning)
-        assert_array_equal(isa.n_iters_, 2)  # one of either iteration
-
-    def test_verbose_prints_a_line_for_each_batch(self, capsys):
-        isa = FastISA(n_init=10, tol=1e-2, random_state=0, verbose=1).fit(FEW)
-        lines = capsys.readouterr().out.splitlines()
-        # It ends early if the best starts agree.
-        counts = [int(re.match(r"\[FastISA\] (\d+)/10 starts, ", x)[1]) for x in lines]
-        assert counts == sorted(set(counts))
-        assert counts[-1] <= 10
-        assert lines[-1].endswith(f" starts, best {isa.log_likelihood_:.6g}")
+def test_verbose_prints_a_line_for_each_batch(capsys):
+    isa = FastISA(n_init=10, tol=1e-2, random_state=0, verbose=1).fit(FEW)
+    lines = capsys.readouterr().out.splitlines()
+    # It ends early if the best starts agree.
+    counts = [int(re.match(r"\[FastISA\] (\d+)/10 starts, ", x)[1]) for x in lines]
+    assert counts == sorted(set(counts))
+    assert counts[-1] <= 10
+    assert lines[-1].endswith(f" starts, best {isa.log_likelihood_:.6g}")
 
 
 # --- PooledFastICA: pooling by covariance and likelihood, criteria, recovery ---------
 
 
 IN_ORDER = np.arange(9) // 3
-
-
-def independent(seed, n_samples=2000, n_signals=9):
-    """Return signals of independent sources, and the true unmixing."""
-    rng = np.random.default_rng(seed)
-    sources = rng.laplace(size=(n_samples, n_signals)) / np.sqrt(2)
-    A = random_rotation(seed, n_signals)
-    return sources @ A.T, A.T
 
 
 def share_inside(isa, covariance):
@@ -246,35 +222,24 @@ def share_inside(isa, covariance):
 @made_once
 def planted_signals():
     """Signals, unmixing, and a covariance with three blocks of sources in it."""
-    signals, unmixing = independent(0)
-    rng = np.random.default_rng(0)
+    rng, A = np.random.default_rng(0), random_rotation(0, 9)
+    signals = rng.laplace(size=(2000, 9)) / np.sqrt(2) @ A.T
     groups = rng.permutation(9).reshape(3, 3)
     C = 0.01 * np.eye(9)
     for group in groups:
-        A = rng.normal(size=(3, 3))
-        C[np.ix_(group, group)] += A @ A.T
-    return signals, unmixing[groups.ravel()], unmixing.T @ C @ unmixing
+        root = rng.normal(size=(3, 3))
+        C[np.ix_(group, group)] += root @ root.T
+    return signals, A.T[groups.ravel()], A @ C @ A.T
 
 
-class TestCovariance:
-    def test_general_coordinates(self):
-        # Signals and covariance change together.
-        signals, unmixing, C = planted_signals()
-        A = np.random.default_rng(1).normal(size=(9, 9))
-        isa = PooledFastICA(n_init=2, random_state=0)
-        isa.fit(signals @ A.T, covariance=A @ C @ A.T)
-        assert subspace_distance(isa.components_ @ A, unmixing) < 0.1
-        assert_allclose(isa.criteria_.max(), share_inside(isa, A @ C @ A.T))
-
-    @pytest.mark.parametrize("seed", slow_after(3, range(8)))
-    def test_best_of_all_groupings(self, seed):
-        signals, _ = independent(seed, 500)
-        A = np.random.default_rng(seed).normal(size=(9, 12))
-        C = A @ A.T
-        isa = PooledFastICA(n_init=1, random_state=seed).fit(signals, covariance=C)
-        pooled = isa.components_ @ C @ isa.components_.T
-        best = max(energy_inside(pooled, z) for z in GROUPINGS)
-        assert_allclose(energy_inside(pooled, IN_ORDER), best)
+def test_covariance_in_general_coordinates():
+    # Signals and covariance change together.
+    signals, unmixing, C = planted_signals()
+    A = np.random.default_rng(1).normal(size=(9, 9))
+    isa = PooledFastICA(n_init=2, random_state=0)
+    isa.fit(signals @ A.T, covariance=A @ C @ A.T)
+    assert subspace_distance(isa.components_ @ A, unmixing) < 0.1
+    assert_allclose(isa.criteria_.max(), share_inside(isa, A @ C @ A.T))
 
 
 def pooled(factor=1.0):
@@ -284,7 +249,7 @@ def pooled(factor=1.0):
 
 
 @start_may_not_converge
-@pytest.mark.parametrize("seed", slow_after(3, range(8)))
+@pytest.mark.parametrize("seed", range(2))
 def test_likeliest_of_all_groupings(seed):
     # So few samples that no grouping stands out.
     signals = np.random.default_rng(seed).laplace(size=(40, 9))
@@ -309,31 +274,6 @@ def test_runs_that_are_not_kept_do_not_warn():
 
 
 class TestCriterion:
-    def test_candidates_are_subspaces_of_different_components(self):
-        signals, _, C = planted_signals()
-        asked = []
-
-        def criterion(candidates):
-            asked.append(candidates)
-            return np.zeros(len(candidates))
-
-        isa = PooledFastICA(n_init=2, random_state=0)
-        isa.fit(signals, covariance=C, criterion=criterion)
-        assert {candidates.shape[1:] for candidates in asked} == {(3, 9)}
-        rows = np.vstack([candidates.reshape(-1, 9) for candidates in asked])
-        # All are rows of the components of the runs: 9 each.
-        assert len(np.unique(rows.round(9), axis=0)) == 18
-        # A row that comes twice makes no candidate for a subspace.
-        assert all((np.linalg.matrix_rank(each) == 3).all() for each in asked)
-
-    def test_no_opinion_leaves_the_first_run_as_pooled(self):
-        signals, _, C = planted_signals()
-        isa = PooledFastICA(n_init=2, random_state=0)
-        isa.fit(signals, covariance=C, criterion=lambda c: np.zeros(len(c)))
-        alone = PooledFastICA(n_init=1, random_state=0).fit(signals, covariance=C)
-        assert_array_equal(isa.criteria_, 0)
-        assert_allclose(share_inside(isa, C), alone.criteria_[0])
-
     @may_not_converge
     @pytest.mark.parametrize("sign", [1.0, -1.0])
     def test_run_with_the_largest_sum_is_kept(self, sign):

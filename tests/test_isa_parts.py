@@ -4,12 +4,11 @@ from functools import cache
 
 import numpy as np
 import pytest
-from layers import slow_after
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import random_rotation, spherical_sources
 from scipy.integrate import quad
 from scipy.linalg import polar
-from scipy.optimize import approx_fprime, linear_sum_assignment, minimize_scalar
+from scipy.optimize import linear_sum_assignment, minimize_scalar
 
 from isa_nrsfm._frames import gauge
 from isa_nrsfm._frames.gauge import (
@@ -19,7 +18,6 @@ from isa_nrsfm._frames.gauge import (
     shared_mixing,
 )
 from isa_nrsfm.datasets import make_nonrigid_tracks
-from isa_nrsfm.isa import _strategies as strategies
 from isa_nrsfm.isa._strategies import (
     fixed_point_step,
     iterate,
@@ -62,45 +60,21 @@ def test_orthogonalise_gives_the_nearest_orthogonal_matrix(smallest):
     assert_allclose(Q[1], np.eye(6), atol=1e-14)
 
 
-class TestStep:
-    @pytest.mark.parametrize("size", [1, 2, 3])
-    def test_by_plain_loops(self, size):
-        Z, W = white_signals(0), starts(0, 4, 6)
-        new = fixed_point_step(W, Z, size)
-        for w, step in zip(W, new, strict=True):
-            assert_allclose(step, published_step(w, Z, size), atol=1e-11)
-
-    def test_shorter_steps_have_the_same_fixed_points(self):
-        Z = white_signals(0)
-        first, ends = starts(0, 1, 6), {"max_iter": 2000, "tol": 1e-14}
-        W, _, converged = iterate(first, Z, 3, **ends)
-        assert converged.all()
-        for length in (1.0, 0.5, 1 / 16):
-            new = fixed_point_step(W, Z, 3, length)
-            assert subspace_change(W, new, 3).max() < 1e-13
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_steps_by_plain_loops(size):
+    Z, W = white_signals(0), starts(0, 4, 6)
+    new = fixed_point_step(W, Z, size)
+    for w, step in zip(W, new, strict=True):
+        assert_allclose(step, published_step(w, Z, size), atol=1e-11)
 
 
-def test_change_is_the_distance_of_projectors():
-    W, V = starts(0, 5, 6), starts(1, 5, 6)
-    for size in (1, 2, 3):
-        expected = []
-        for w, v in zip(W, V, strict=True):
-            a, b = w.reshape(-1, size, 6), v.reshape(-1, size, 6)
-            difference = a.swapaxes(1, 2) @ a - b.swapaxes(1, 2) @ b
-            expected.append(np.max(np.sum(difference**2, axis=(1, 2))) / 2 / size)
-        assert_allclose(subspace_change(W, V, size), expected)
-
-
-def slope_of_the_density(u):
-    return strategies.derivatives(u)[0]
-
-
-@pytest.mark.parametrize("energy", [0.0, 1e-6, 0.1, 1.0, 3.0, 50.0, 1e4])
-def test_derivatives_of_the_density(energy):
-    u, step = np.array([energy]), 1e-6 * (energy + 0.1)
-    g, dg = strategies.derivatives(u)
-    for found, function in ((g, strategies.log_density), (dg, slope_of_the_density)):
-        assert_allclose(found, approx_fprime(u, function, step)[0], rtol=1e-5)
+def test_shorter_steps_have_the_same_fixed_points():
+    Z = white_signals(0)
+    W, _, converged = iterate(starts(0, 1, 6), Z, 3, max_iter=2000, tol=1e-14)
+    assert converged.all()
+    for length in (1.0, 0.5, 1 / 16):
+        new = fixed_point_step(W, Z, 3, length)
+        assert subspace_change(W, new, 3).max() < 1e-13
 
 
 # Samples of a kind, from normal ones
@@ -153,26 +127,23 @@ def cosines(truth, recovered):
 
 
 class TestRecovery:
-    @pytest.mark.parametrize("seed", slow_after(1, range(5)))
     @pytest.mark.parametrize(
-        ("n_components", "n_points", "least"),
-        [(2, 68, 0.97), (5, 68, 0.95), (9, 500, 0.99)],
+        ("n_components", "n_points", "least"), [(5, 68, 0.95), (9, 500, 0.99)]
     )
-    def test_basis_shapes(self, n_components, n_points, least, seed):
+    def test_basis_shapes(self, n_components, n_points, least):
         sizes = {"n_points": n_points, "n_components": n_components}
-        truth = make_nonrigid_tracks(10, **sizes, random_state=seed).basis
-        mixed = np.tensordot(random_mixing(seed, n_components), truth, 1)
+        truth = make_nonrigid_tracks(10, **sizes, random_state=0).basis
+        mixed = np.tensordot(random_mixing(0, n_components), truth, 1)
         assert cosines(truth, unmix(mixed)).min() > least
 
-    @pytest.mark.parametrize(("n_frames", "least"), [(400, 0.96), (1500, 0.99)])
-    def test_coefficients(self, n_frames, least):
+    def test_coefficients(self):
         options = {"coefficients": "heavy_tailed", "random_state": 0}
-        truth = make_nonrigid_tracks(n_frames, n_components=5, **options).alpha
+        truth = make_nonrigid_tracks(1500, n_components=5, **options).alpha
         mixed = truth @ random_mixing(0, 5).T
         found = mixed @ independent_coefficients(mixed).T
-        assert cosines(truth.T[..., None], found.T[..., None]).min() > least
+        assert cosines(truth.T[..., None], found.T[..., None]).min() > 0.99
 
-    @pytest.mark.parametrize(("size", "seed"), [(1, 0), (2, 1), (3, 2)])
+    @pytest.mark.parametrize(("size", "seed"), [(1, 0), (3, 2)])
     def test_heavy_light_and_gaussian_tails_together(self, size, seed):
         kinds = ["product", "gaussian", "uniform", "student", "laplace", "uniform"]
         truth = sources(kinds, seed, 1500, size)
@@ -195,19 +166,11 @@ class TestRecovery:
         assert cosines(truth, unmix(mixed)).min() > 0.99
 
 
-def test_variance_and_shift_of_coefficients():
-    alpha = np.random.default_rng(0).laplace(size=(300, 3))
-    W = independent_coefficients(alpha)
-    assert_allclose(np.std(alpha @ W.T, axis=0), 1.0, rtol=1e-12)
-    shift = np.array([5.0, 0.0, -3.0])
-    assert_allclose(independent_coefficients(alpha + shift), W)
-
-
 @pytest.mark.parametrize("size", [1, 3])
 @pytest.mark.parametrize(
     "kinds",
-    [["product"] * 4, ["student", "product", "gaussian", "uniform"], ["gaussian"] * 4],
-    ids=["heavy", "mixed", "gaussian"],
+    [["student", "product", "gaussian", "uniform"], ["gaussian"] * 4],
+    ids=["mixed", "gaussian"],
 )
 def test_invariance_to_basis_order_of_samples_and_rotations(kinds, size, rng):
     signals = sources(kinds, 0, 200 if size == 1 else 68, size)
@@ -258,9 +221,7 @@ def log_likelihood(W, Z):
 
 
 class TestOptimality:
-    @pytest.mark.parametrize(
-        ("size", "unit"), [(1, 1.0), (1, 30.0), (3, 1.0), (3, 0.1)]
-    )
+    @pytest.mark.parametrize(("size", "unit"), [(1, 30.0), (3, 1.0)])
     def test_no_mixing_near_by_is_likelier(self, size, unit, rng):
         kinds = ["product", "uniform", "student", "laplace"]
         Z = unit * sources(kinds, 0, 200, size)
@@ -317,16 +278,6 @@ def test_ascent_maximises_the_quadratic_model_or_there_is_none(rng):
         assert gauge._ascent(np.ones((5, 5)), blocks, shift, 3) is None
 
 
-def test_few_samples_are_spread_from_the_smallest_to_the_largest(rng):
-    many = rng.normal(size=(2, 6000, 3))
-    chosen = gauge._few_samples(many)
-    assert chosen.shape == (2, 1500, 3)
-    sizes = [np.sort(np.sum(Z**2, axis=(0, 2))) for Z in (chosen, many)]
-    place = np.searchsorted(sizes[1], sizes[0])
-    assert (place[0], place[-1]) == (0, 5999)
-    assert set(np.diff(place)) <= {3, 4, 5}
-
-
 class TestDegenerate:
     @pytest.mark.parametrize("size", [1, 3])
     def test_dependent_signals(self, size):
@@ -368,8 +319,3 @@ class TestDegenerate:
         again = matched(found[:rank], unmix(mixed)[:rank])
         if n_moving > 1:
             assert_allclose(again, found[:rank], atol=1e-7)
-
-    def test_signals_of_few_values(self):
-        signs = np.random.default_rng(0).choice([-1.0, 1.0], size=(3, 200, 1))
-        Y = unmix(np.tensordot(random_mixing(0, 3), signs, 1))
-        assert cosines(signs, Y).min() > 0.99

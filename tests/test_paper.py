@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from scenes import random_rotation, spherical_sources
+from scenes import measurements, random_rotation, spherical_sources
 from sklearn.base import BaseEstimator
 
 from isa_nrsfm import AffineNRSfM, FastISA, PooledFastICA
+from isa_nrsfm.datasets import make_nonrigid_tracks
 
 both = pytest.mark.parametrize("refinement", ["alternating", None])
 
@@ -54,16 +55,9 @@ def ideal_matrix(seed, K, n_points=400, n_cameras=15):
 @pytest.fixture(scope="module")
 def faces():
     """A table of few faces with real-like structure: 2D images of a bending shape."""
-    rng = np.random.default_rng(0)
-    shape, basis = rng.normal(size=(3, 40)), spherical_sources(0, 40, 3).T
-    basis = basis.reshape(3, 3, 40) * np.array([0.3, 0.2, 0.1])[:, None, None]
-    frames = [
-        random_rotation(i)[:2] @ (shape + np.tensordot(rng.normal(size=3), basis, 1))
-        for i in range(60)
-    ]
-    W = np.vstack(frames)
-    W = W + 0.01 * rng.normal(size=W.shape)
-    return W - W.mean(axis=1, keepdims=True)
+    options = {"coefficients": "heavy_tailed", "noise": 0.01, "random_state": 0}
+    tracks = make_nonrigid_tracks(60, 40, 3, **options).tracks
+    return measurements(tracks, scale_frames=False)
 
 
 def cosines(model, shapes):
@@ -88,7 +82,7 @@ class TestIdealData:
 
     @pytest.mark.parametrize("strategy", [FastISA, PooledFastICA])
     def test_three_basis_shapes_are_found_up_to_sampling(self, strategy):
-        W, shapes = ideal_matrix(0, 3, n_points=2000)
+        W, shapes = ideal_matrix(0, 3, n_points=1000)
         model = run(W, 3, strategy(n_init=3, random_state=0))
         assert model.inverse_snr_ < 1e-3
         assert cosines(model, shapes).max(axis=1).min() > 0.97

@@ -62,9 +62,7 @@ def test_factors_are_the_best_approximation_white_and_ordered(size, K):
     assert_allclose(M.T @ M, np.diag(energy), rtol=1e-7, atol=1e-12 * energy[0])
 
 
-@pytest.mark.parametrize(
-    ("rank", "K"), [(1, 1), (3, 2), (4, 2), (7, 1), (8, 2), (12, 3)]
-)
+@pytest.mark.parametrize(("rank", "K"), [(1, 1), (3, 2), (4, 2), (7, 1), (12, 3)])
 def test_only_directions_above_rounding_errors_are_used(rank, K):
     W = low_rank(rank, rank)
     f = factorise(W, K)
@@ -87,25 +85,23 @@ def test_only_directions_above_rounding_errors_are_used(rank, K):
         assert_allclose(approximation(f), W, atol=1e-12)
 
 
-class TestOrientations:
-    @pytest.mark.parametrize("unit", [1e-250, 1e250])
-    def test_opposite_rows_permutations_and_units(self, unit, rng):
-        rows = rng.normal(size=(6, 11))
-        signs = orientations(rows)
-        assert_array_equal(orientations(-rows), -signs)
-        assert_array_equal(orientations(unit * rows), signs)
-        assert_array_equal(orientations(rows[:, rng.permutation(11)]), signs)
-        assert_array_equal(orientations(signs[:, None] * rows), 1)
+@pytest.mark.parametrize("unit", [1e-250, 1e250])
+def test_orientations_of_opposite_rows_permutations_and_units(unit, rng):
+    rows = rng.normal(size=(6, 11))
+    signs = orientations(rows)
+    assert_array_equal(orientations(-rows), -signs)
+    assert_array_equal(orientations(unit * rows), signs)
+    assert_array_equal(orientations(rows[:, rng.permutation(11)]), signs)
 
-    def test_sign_of_the_third_moment_or_of_the_extreme_entry(self):
-        rows = np.array([[2.0, -1.0, -1.0], [-2.0, 1.0, 1.0], [0.0, 0.0, 3.0]])
-        assert_array_equal(orientations(rows), [1, -1, 1])
-        assert_array_equal(orientations(np.zeros((2, 5))), 1)
-        # Third moments of rounding errors do not decide.
-        half = np.random.default_rng(0).normal(size=(50, 9))
-        rows = np.hstack([half, -half[:, ::-1]])
-        extreme = rows[np.arange(50), np.abs(rows).argmax(axis=1)]
-        assert_array_equal(orientations(rows), np.sign(extreme))
+
+def test_orientation_is_the_sign_of_the_third_moment_or_of_the_extreme_entry(rng):
+    rows = np.array([[2.0, -1.0, -1.0], [-2.0, 1.0, 1.0], [0.0, 0.0, 3.0], 3 * [0.0]])
+    assert_array_equal(orientations(rows), [1, -1, 1, 1])
+    # Third moments of rounding errors do not decide.
+    half = rng.normal(size=(50, 9))
+    rows = np.hstack([half, -half[:, ::-1]])
+    extreme = rows[np.arange(50), np.abs(rows).argmax(axis=1)]
+    assert_array_equal(orientations(rows), np.sign(extreme))
 
 
 LARGE = 30  # matrices with more rows and columns count as large
@@ -174,10 +170,10 @@ def test_frames_are_spread_from_the_most_to_the_least_rigid_one():
     energy = np.sum(rest.reshape(100, -1) ** 2, axis=1)
     found = rigid_energy(W.reshape(100, 2, -1), factors.rigid_shape)
     assert_allclose(found, energy)
-    chosen = energy[spread(np.argsort(energy), 21)]
-    assert (np.diff(chosen) > 0).all()
-    assert (len(chosen), chosen[0], chosen[-1]) == (21, energy.min(), energy.max())
-    assert_array_equal(sample(W)[1][0], np.sort(spread(np.argsort(energy), 40)))
+    order = np.argsort(energy)
+    chosen = spread(order, 40)
+    assert (chosen[0], chosen[-1]) == (order[0], order[-1])
+    assert_array_equal(sample(W)[1][0], np.sort(chosen))
 
 
 def test_representative_frames_are_spread_and_show_rare_points():
@@ -185,24 +181,20 @@ def test_representative_frames_are_spread_and_show_rare_points():
     order = np.random.default_rng(0).permutation(300)
     rows = np.ones((300, 2, 4))
     rows[order, 0] = np.linspace(0.1, 2.0, 300)[:, None]
-    blocks = FrameBlocks.of_array(rows, 64)
-    assert_array_equal(representative_frames(blocks, 300), np.arange(300))
     for unit in (1.0, 2.0**-20):
-        found = representative_frames(FrameBlocks.of_array(unit * rows, 64), 50)
-        assert_array_equal(found, np.sort(spread(order, 50)))
+        blocks = FrameBlocks.of_array(unit * rows, 64)
+        assert_array_equal(representative_frames(blocks, 300), np.arange(300))
+        chosen = representative_frames(blocks, 50)
+        assert_array_equal(chosen, np.sort(spread(order, 50)))
     rows[:, :, 1:3] = np.nan
-    rows[order[::7], :, 1] = 1.0  # in 43 frames, and in 5 of those that are spread
+    rows[order[::7], :, 1] = 1.0  # in 43 frames
     rows[order[3:6], :, 2] = 1.0  # in three frames
-    # The order of the shares has changed little: compare by it.
-    halves = np.nansum(rows[:, 0] ** 2, axis=1) / np.nansum(rows**2, axis=(1, 2))
-    order = np.argsort(halves, kind="stable")
-    chosen = set(spread(order, 50).tolist())
-    for point, n in ((1, 10), (2, 3)):
-        seen = ~np.isnan(rows[order, 0, point])
-        assert sum(not np.isnan(rows[i, 0, point]) for i in chosen) < n
-        chosen |= set(spread(order[seen], n).tolist())
-    blocks = FrameBlocks.of_array(rows, 64)
-    assert_array_equal(representative_frames(blocks, 50), sorted(chosen))
+    chosen = representative_frames(FrameBlocks.of_array(rows, 64), 50)
+    assert (np.diff(chosen) > 0).all()
+    assert len(chosen) <= 50 + 10 + 3
+    n_seen = np.sum(~np.isnan(rows[chosen, 0]), axis=0)
+    assert n_seen[1] >= 10
+    assert n_seen[2] == 3
 
 
 ALL_METHODS = pytest.mark.parametrize("method", BLOCK_RECOVERIES)
@@ -255,15 +247,6 @@ class TestAllMethods:
         assert_allclose(np.linalg.norm(D, axis=(1, 2)), 1)
         assert_allclose(direction(D), direction(np.linalg.inv(scene.E)), atol=1e-8)
 
-    @pytest.mark.parametrize("unit", [1e-9, 1e9])
-    def test_units(self, method, unit):
-        scene = structured_motion(0, noise=0.3)
-        D = recover_blocks(motion_products(scene.rigid, scene.motion), method)
-        for of_rigid, of_motion in ((unit, unit), (1.0, unit), (unit, 1.0)):
-            changed = of_rigid * scene.rigid, of_motion * scene.motion
-            other = recover_blocks(motion_products(*changed), method)
-            assert_allclose(direction(other), direction(D), atol=1e-7)
-
     @pytest.mark.parametrize(
         ("part", "zeros"),
         [
@@ -299,13 +282,6 @@ class TestSingleMethods:
         published = np.array([published_irls(scene, k, 25) for k in range(3)])
         assert_allclose(np.linalg.norm(published, axis=(1, 2)), 1)
         assert_allclose(direction(D), direction(published), atol=1e-9)
-
-    def test_irls_where_the_first_frame_says_nothing(self):
-        scene = structured_motion(0, noise=0.5)
-        scene.motion[:2] = 0
-        products = motion_products(scene.rigid, scene.motion)
-        expected = recover_blocks(products, "generalized_eigen")
-        assert_allclose(recover_blocks(products, "irls"), expected)
 
 
 def explained(scene, E):
@@ -360,7 +336,8 @@ class TestRefinement:
             cases.append((scene._replace(rigid=rigid, motion=motion), starts, expected))
         factors = np.array([1e-6, -1.0, 1e6, -7.0])[:, None, None]
         padded = np.concatenate([np.zeros((3, 1, 3, 3)), factors * starts], axis=1)
-        for changed, given, wanted in [*cases, (scene, padded, expected)]:
+        cases.append((scene, padded, expected))
+        for changed, given, wanted in cases:
             other = direction(refined(changed, given)[0])
             assert_allclose(other, wanted, atol=1e-6)
 

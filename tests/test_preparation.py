@@ -54,51 +54,28 @@ def test_stored_blocks_are_computed_when_they_are_needed(array):
     frames = np.isin(np.arange(N_FRAMES), [0, 22])
     assert_array_equal(later.subset(frames).whole(), array[frames])
     assert max(calls) == 10
-    for kept, n_times in ((True, 1), (False, 2)):
-        calls.clear()
-        blocks = FrameBlocks.of_array(array, 10).derive(recorded, kept=kept)
-        blocks.whole()
-        blocks.whole()
-        assert calls == [10, 10, 3] * n_times
+    calls.clear()
+    kept = FrameBlocks.of_array(array, 10).derive(recorded, kept=True)
+    assert_array_equal(kept.whole(), kept.whole())
+    assert calls == [10, 10, 3]
 
 
-@pytest.mark.parametrize(("n_frames", "lengths"), [(10, [9, 9, 5]), (2, [3] * 7 + [2])])
-def test_small_blocks_are_regrouped(array, n_frames, lengths):
-    larger = FrameBlocks.of_array(array, 3).regrouped(np.concatenate, n_frames)
-    assert larger.lengths == lengths
-    assert_array_equal(larger.whole(), array)
+def test_threads_have_few_results_ahead_and_raise_their_errors(array):
+    threads = []
 
+    def recorded(block):
+        threads.append(threading.get_ident())
+        if len(threads) == 8:
+            raise ValueError("no good")
 
-@pytest.mark.parametrize(
-    ("n_threads", "length", "others"), [(3, 5, True), (1, 5, False), (3, 23, False)]
-)
-@pytest.mark.parametrize("make", [FrameBlocks.of_array, stored])
-def test_threads_are_used_for_several_blocks(array, make, n_threads, length, others):
-    blocks = make(array, length, n_threads=n_threads).derive(lambda block: block)
-    for each in (blocks, blocks.subset(np.full(N_FRAMES, True))):
-        threads = set(each.map(lambda block: threading.get_ident()))
-        assert (threading.get_ident() not in threads) == others
-
-
-def test_threads_have_few_results_ahead(array):
-    begun = []
-    found = FrameBlocks.of_array(array, 2, n_threads=2).map(begun.append)
+    found = FrameBlocks.of_array(array, 2, n_threads=2).map(recorded)
     for number in range(1, 6):
         next(found)
-        assert len(begun) <= number + 2
-    found.close()
-
-
-def test_an_error_in_a_thread_is_raised_and_no_further_block_is_begun(array):
-    begun = []
-
-    def fail(block):
-        begun.append(block)
-        raise ValueError("no good")
-
+        assert len(threads) <= number + 2
     with pytest.raises(ValueError, match="no good"):
-        list(FrameBlocks.of_array(array, 2, n_threads=2).map(fail))
-    assert len(begun) <= 3
+        list(found)
+    assert len(threads) <= 10
+    assert threading.get_ident() not in threads
 
 
 # --- robust losses: weights, scales that outliers hardly change, gross outliers -------
@@ -227,12 +204,10 @@ class TestGrossOutliers:
     def test_of_clean_tables_there_are_none(self, noise):
         assert not gross_outliers(rigid_tracks(noise)).any()
 
-    @pytest.mark.parametrize(
-        ("n_frames", "distance", "missing"), [(40, 0.5, 0), (200, 2, 0), (40, 2, 0.1)]
-    )
-    def test_are_those_that_were_moved(self, n_frames, distance, missing):
+    @pytest.mark.parametrize(("distance", "missing"), [(0.5, 0), (2, 0.1)])
+    def test_are_those_that_were_moved(self, distance, missing):
         # The object is that of at most 60 frames.
-        tracks, where = spoilt(rigid_tracks(n_frames=n_frames), distance)
+        tracks, where = spoilt(rigid_tracks(n_frames=80), distance)
         hidden = np.random.default_rng(2).random(where.shape) < missing
         tracks[hidden] = np.nan
         found = gross_outliers(tracks)
@@ -289,24 +264,23 @@ def unit_rows(tracks):
 
 
 def completed(tracks, n_components):
-    """Return tracks in place of those with missing points."""
-    rows, translation, sizes = unit_rows(tracks)
+    """Return tracks in place of those with missing points, centred and of size one."""
+    rows, _, _ = unit_rows(tracks)
     filled = filled_in(rows, completion_model(rows, 3 * n_components + 3))
     assert_allclose(filled.mean(axis=2), 0, atol=1e-12)
     # Seen points are the given ones minus a shift.
     filled += np.nanmean(rows - filled, axis=2, keepdims=True)
     assert_allclose(np.where(np.isnan(rows), filled, rows), filled, rtol=0, atol=1e-12)
-    return sizes[:, None, None] * filled.transpose(0, 2, 1) + translation[:, None]
+    return filled.transpose(0, 2, 1)
 
 
-def held_out_error(tracks, seen, n_components, usable=True):
-    """Return the inverse SNR of the hidden points, frames of unit size."""
-    filled = completed(hide(tracks, seen), n_components)
-    _, translation, sizes = unit_rows(hide(tracks, seen))
-    error = np.sum((filled - tracks) ** 2, axis=2)
-    energy = np.sum((tracks - translation[:, None]) ** 2, axis=2)
-    weights = np.where(~seen, (usable / sizes**2)[:, None], 0.0)
-    return np.sum(weights * error) / np.sum(weights * energy)
+def held_out_error(tracks, seen, n_components):
+    """Return the root of the inverse SNR of the hidden points."""
+    hidden = hide(tracks, seen)
+    _, translation, sizes = unit_rows(hidden)
+    truth = (tracks - translation[:, None]) / sizes[:, None, None]
+    error = completed(hidden, n_components) - truth
+    return np.linalg.norm(error[~seen]) / np.linalg.norm(truth[~seen])
 
 
 # --- the model ----------------------------------------------------------------------
@@ -352,7 +326,7 @@ def test_missing_points_are_conditional_expectations(small):
 
 
 def test_the_fit_is_a_stationary_point_of_the_likelihood(small, rng):
-    B, noise = completion_model(small, 3, tol=-1.0, max_iter=2000)  # never ends before
+    B, noise = completion_model(small, 3, tol=-1.0, max_iter=500)  # never ends before
     best = log_likelihood(B, noise, small)
     steps = [1e-4 * rng.normal(size=B.shape) * np.std(B) for _ in range(10)]
     near = [[(B + step, noise), (B - step, noise)] for step in steps]
@@ -360,22 +334,6 @@ def test_the_fit_is_a_stationary_point_of_the_likelihood(small, rng):
         up, down = (log_likelihood(*parameters, small) for parameters in pair)
         assert abs(up - down) < 1e-6
         assert max(up, down) < best
-
-
-# --- exact tables -------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("n_frames", "n_points", "n_components", "missing"),
-    [(60, 30, 3, 0.3), (300, 68, 9, 0.2)],
-)
-def test_tables_without_noise(n_frames, n_points, n_components, missing):
-    scene = make_nonrigid_tracks(n_frames, n_points, n_components, random_state=0)
-    seen = random_mask((n_frames, n_points), missing, 0)
-    determined = seen.sum(axis=1) >= 3 * n_components + 4
-    assert determined.mean() > 0.95
-    error = held_out_error(scene.tracks, seen, n_components, determined)
-    assert np.sqrt(error) < 1e-7
 
 
 def test_points_that_are_never_seen_together(rng):
@@ -386,18 +344,7 @@ def test_points_that_are_never_seen_together(rng):
     tracks, seen = image[..., :2], image[..., 2] > 0.3
     together = seen.T.astype(float) @ seen
     assert np.mean(together == 0) > 0.1
-    assert np.sqrt(held_out_error(tracks, seen, 0)) < 1e-6
-
-
-def test_faces_that_hide_a_side(load_data):
-    tracks = load_data("muct_68")["W2d"].astype(float)
-    seen = ~np.isnan(tracks).any(axis=2)
-    complete = seen.all(axis=1)
-    # The sides that other frames hide, on frames of which they are known.
-    known, patterns = tracks[complete], seen[~complete]
-    mask = np.ones(known.shape[:2], dtype=bool)
-    mask[:: len(known) // len(patterns)][: len(patterns)] = patterns
-    assert 100 * held_out_error(known, mask, 9) < 0.4
+    assert held_out_error(tracks, seen, 0) < 1e-6
 
 
 # --- degenerate tables --------------------------------------------------------------
@@ -405,19 +352,18 @@ def test_faces_that_hide_a_side(load_data):
 
 @pytest.mark.parametrize(
     ("n_components", "dtype", "limit"),
-    [(1, np.float64, 1e-5), (5, np.float64, 3e-4), (5, np.float32, 3e-4)],
+    [(1, np.float64, 1e-5), (5, np.float32, 3e-4)],
 )
 def test_rigid_and_flat_objects_and_more_basis_shapes(n_components, dtype, limit, rng):
     seen = random_mask((200, 40), 0.3, 0)
     rigid = make_nonrigid_tracks(200, 40, 0, random_state=0).tracks
     flat = rng.normal(size=(40, 2)) @ rng.normal(size=(200, 2, 2)) + 5
     for tracks in (rigid, flat):
-        error = held_out_error(tracks.astype(dtype), seen, n_components)
-        assert np.sqrt(error) < limit
+        assert held_out_error(tracks.astype(dtype), seen, n_components) < limit
 
 
 def test_small_tables_and_points_and_frames_that_are_rarely_seen():
-    for n_frames, n_points in ((8, 13), (8, 68), (100, 30)):
+    for n_frames, n_points in ((8, 13), (100, 30)):
         tracks = make_nonrigid_tracks(n_frames, n_points, 3, random_state=0).tracks
         seen = random_mask((n_frames, n_points), 0.1, 3)
         assert np.isfinite(completed(hide(tracks, seen), 3)).all()
