@@ -8,10 +8,9 @@ import pytest
 from layers import may_not_converge, slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
-from refusals import refusals_of, refused, warned
+from refusals import refusals_of, refused
 from scenes import random_cameras, table_of, with_gaps  # noqa: F401  in refusals.txt
 from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.linear_model import LogisticRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.utils import estimator_checks
@@ -232,12 +231,6 @@ class TestLowRank:
         rest = np.linalg.lstsq(np.column_stack([alpha, np.ones(50)]), expected)[1]
         assert (rest / np.sum(expected**2, axis=0) < 0.02).all()
 
-    def test_too_few_steps(self):
-        model = BlockMatrixNRSfM(2, max_iter=2)
-        options = {"category": ConvergenceWarning}
-        warned("converge in max_iter=2 steps", model.fit, table().data, **options)
-        assert 18 <= model.n_iter_ <= 36
-
 
 def sparse_scene(n_frames, n_points, n_atoms, sparsity=2):
     """Return a table of sums of so many random atoms, its cameras and its shapes."""
@@ -269,16 +262,16 @@ def error_of_frames(shapes, motion, model):
 class TestCompressible:
     def test_exact_table(self):
         # In pixels and away from the origin
-        X, cameras, shapes = sparse_scene(300, 50, 5)
-        X = 100 * X + np.tile([300.0, 200.0], 50)
+        X, cameras, shapes = sparse_scene(150, 30, 5)
+        X = 100 * X + np.tile([300.0, 200.0], 30)
         model = CompressibleNRSfM(4, max_iter=60, tol=1e-8, random_state=0).fit(X)
         assert model.dictionary_residual_ < 1e-3
         assert model.inverse_snr_ < 2e-3
-        assert (model.n_users_ > 60).all()
+        assert (model.n_users_ > 30).all()
         assert error_of_frames(100 * shapes, cameras, model) < 0.05
 
-    # More frames than the relaxed problem has, and a rigid shape.
-    @pytest.mark.parametrize("size", [(1100, 12, 3), (50, 20, 1)])
+    # A rigid shape, and more frames than the relaxed problem has.
+    @pytest.mark.parametrize("size", slow_after(1, [((50, 20, 1),), ((1100, 12, 3),)]))
     def test_one_atom_a_frame(self, size):
         X, cameras, shapes = sparse_scene(*size, sparsity=1)
         model = CompressibleNRSfM(2, n_atoms=size[2], sparsity=1, random_state=0)
@@ -308,27 +301,23 @@ class TestCompressible:
         assert model.dictionary_residual_ < 1e-12
 
 
-SHARK, YOGA = "shark_torresani", "akhter_yoga"
-DRINK, PICKUP = "akhter_drink", "akhter_pickup"
+SHARK, YOGA, DRINK = "shark_torresani", "akhter_yoga", "akhter_drink"
 sparse = partial(CompressibleNRSfM, 1)
 
 
 # Of the shark, shapes of rank two: no sparse dictionary is unique, and the bounds are
 # the errors of the released code of the publication.
 SEQUENCES = [
-    (SHARK, BlockMatrixNRSfM(1), 0.00258, 0.244),
     (YOGA, PseudoInverseNRSfM(9), 5.04e-4, 0.611),
     (SHARK, sparse(n_atoms=1, sparsity=1, random_state=0), 0.0118, 0.25),
-    (YOGA, BlockMatrixNRSfM(9), 5.32e-5, 0.0342),
+    (SHARK, BlockMatrixNRSfM(1), 0.00258, 0.244),
     (DRINK, BlockMatrixNRSfM(11), 1.32e-5, 0.0227),
-    (PICKUP, PseudoInverseNRSfM(11), 2.67e-4, 0.547),
     (SHARK, sparse(n_atoms=3, random_state=0), 0.27, 1.3),
-    (SHARK, sparse(n_atoms=20, random_state=0), 1.0, 2.6),
 ]
 OF_SEQUENCES = ("name", "model", "inverse_snr", "error")
 
 
-@pytest.mark.parametrize(OF_SEQUENCES, slow_after(3, SEQUENCES))
+@pytest.mark.parametrize(OF_SEQUENCES, slow_after(2, SEQUENCES))
 def test_public_sequences(load_data, name, model, inverse_snr, error):
     data = load_data(name)
     model.fit(table_of(data["W2d"]))

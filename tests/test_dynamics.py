@@ -126,9 +126,8 @@ def test_coefficients_have_the_matern_covariance():
 class TestSmoother:
     @pytest.mark.parametrize("gaps", [False, True])
     def test_is_the_posterior_of_the_joint_normal_distribution(
-        self, gaps, n_walks, n_shares
+        self, gaps, n_walks, n_shares, rng
     ):
-        rng = np.random.default_rng(0)
         dynamics = some_dynamics(n_walks, n_shares=n_shares)
         data = observed(rng.normal(size=(9, K + n_walks)), rng)
         if gaps:
@@ -143,8 +142,7 @@ class TestSmoother:
         assert_allclose(covariances, expected, atol=atol)
         assert_allclose(value, likelihood)
 
-    def test_gradient_is_that_of_the_likelihood(self, n_walks, n_shares):
-        rng = np.random.default_rng(1)
+    def test_gradient_is_that_of_the_likelihood(self, n_walks, n_shares, rng):
         dynamics = some_dynamics(n_walks, n_shares=n_shares)
         data = observed(rng.normal(size=(9, K + n_walks)), rng)
         splits = np.cumsum([len(each) for each in dynamics])[:-1]
@@ -157,40 +155,26 @@ class TestSmoother:
         assert_allclose(got, expected, rtol=1e-3, atol=2e-3)
 
 
-@pytest.mark.parametrize("noise", slow_after(1, [0.2, 1e-6]))
-def test_rates_are_found(noise):
-    rng, true = np.random.default_rng(0), some_dynamics(1, n_shares=0)
-    data = [observed(simulated(100, rng, true), rng, noise) for _ in range(2)]
-    found = estimated_dynamics(data, K, False, 30, 1.0)
+def test_rates_are_found(rng):
+    true = some_dynamics(1, n_shares=0)
+    data = observed(simulated(150, rng, true), rng, 0.2)
+    found = estimated_dynamics([data], K, False, 30, 1.0)
     assert_allclose(found.rates, true.rates, atol=0.5)
     assert_allclose(found.walks, true.walks, atol=0.5)
 
 
-@pytest.mark.parametrize("seed", slow_after(1, range(3)))
-def test_independent_frames_have_no_rates(seed):
-    rng = np.random.default_rng(seed)
-    data = observed(rng.normal(size=(100, K)), rng, 1.0)
-    assert estimated_dynamics([data], K, False, 100, 0.1) is None
-
-
 class TestPeople:
-    @pytest.mark.parametrize(
-        ("n_people", "n_frames"), slow_after(1, [(4, 30), (30, 3)])
-    )
-    def test_photos_in_any_order_have_no_dynamics(self, n_people, n_frames):
-        rng, person = np.random.default_rng(0), np.arange(n_people).repeat(n_frames)
-        x = np.sqrt(0.8) * rng.normal(size=(n_people, K))[person]
+    def test_photos_in_any_order_have_no_dynamics(self, rng):
+        person = np.arange(4).repeat(15)
+        x = np.sqrt(0.8) * rng.normal(size=(4, K))[person]
         x += np.sqrt(0.2) * rng.normal(size=x.shape)
         assert not len(smooth_people(alone(x, rng), person).time_scales)
 
-    @pytest.mark.parametrize("groups", slow_after(1, [None, np.zeros(150)]))
-    def test_photos_of_one_unusual_person_have_none(self, groups):
-        rng = np.random.default_rng(0)
-        frames = alone(1.5 + 0.4 * rng.normal(size=(150, K)), rng)
-        assert not len(smooth_people(frames, groups).time_scales)
+    def test_photos_of_one_unusual_person_have_none(self, rng):
+        frames = alone(1.5 + 0.4 * rng.normal(size=(60, K)), rng)
+        assert not len(smooth_people(frames, None).time_scales)
 
-    def test_videos_of_people_are_smoothed(self):
-        rng = np.random.default_rng(0)
+    def test_videos_of_people_are_smoothed(self, rng):
         person = np.repeat(np.arange(8), 30)
         true = Dynamics(np.full(K, np.log(0.3)), np.empty(0), np.empty(0))
         x = np.concatenate([simulated(30, rng, true) for _ in range(8)])
@@ -214,7 +198,7 @@ def test_steps_between_cameras_move_one_to_the_other(name, rng):
 
 
 @pytest.mark.parametrize("loss", ["linear", "cauchy"])
-@pytest.mark.parametrize("name", slow_after(1, CAMERAS))
+@pytest.mark.parametrize("name", slow_after(1, ["affine", "weak_perspective"]))
 def test_likelihood_of_frames_is_linearised(name, loss):
     scene = make_nonrigid_tracks(60, 12, 2, camera=name, noise=0.02, random_state=0)
     table = with_gaps(scene.data + 50, 0.2)
@@ -246,13 +230,14 @@ def test_likelihood_of_frames_is_linearised(name, loss):
 
 
 @made_once
-def waving_model():
-    """Return a model of a thing that waves, its table in order of time."""
+def waving_model(n_frames=60):
+    """Return a model of a thing that waves, and first rows of its table in time."""
     rng = np.random.default_rng(0)
     tracks = waving_scene(100, 20, [0.1, 0.07])[0].tracks
     tracks += 0.15 * tracks.std() * rng.normal(size=tracks.shape)
     table = table_of(with_gaps(tracks, 0.4))
-    return AffineNRSfM(2, random_state=0, scale_frames=False).fit(table), table
+    model = AffineNRSfM(2, random_state=0, scale_frames=False).fit(table)
+    return model, table[:n_frames]
 
 
 def smoothed_waves(**options):
@@ -261,9 +246,8 @@ def smoothed_waves(**options):
 
 
 class TestSmooth:
-    def test_cameras_are_smoothed(self):
-        rng, t = np.random.default_rng(0), np.arange(100)
-        shapes = waving_scene(100, 20, [0.1, 0.07])[0].shapes
+    def test_cameras_are_smoothed(self, rng):
+        t, shapes = np.arange(100), waving_scene(100, 20, [0.1, 0.07])[0].shapes
         turns = np.stack([0.3 * np.sin(0.1 * t), 0.05 * t, 0.2 * np.cos(0.05 * t)], 1)
         truth = shapes @ Rotation.from_rotvec(turns).as_matrix().mT
         tracks = truth[..., :2] + 0.1 * truth.std() * rng.normal(size=(100, 20, 2))
@@ -279,7 +263,7 @@ class TestSmooth:
         assert error(smooth) < 0.7 * error(model.decompose(table))
 
     def test_ordered_frames_are_smoothed(self):
-        model, table = waving_model()
+        model, table = waving_model(100)
         found = model.smooth(table)
         assert found.time_scales.shape == (2,)
         assert (found.alpha_std < 0.8 * model.alpha_std_).mean() > 0.9
@@ -288,47 +272,41 @@ class TestSmooth:
 
     def test_times_or_dates_say_where_the_gaps_are(self):
         model, table = waving_model()
-        kept = np.r_[0:60, 66:100]
-        blank = table.copy()
-        blank[60:66] = np.nan
-        dates = np.datetime64("2026-01-01") + kept * np.timedelta64(40, "ms")
-        expected = model.smooth(blank, time=0.04 * np.arange(100), **FEW_STEPS)
-        found = model.smooth(table[kept], time=dates, **FEW_STEPS)
-        assert_allclose(found.alpha, expected.alpha[kept], atol=1e-12)
-        assert_allclose(found.time_scales, expected.time_scales)
+        kept, blank = np.r_[0:36, 42:60], table.copy()
+        blank[36:42] = np.nan
+        seconds = 3600.0 * np.arange(60)
+        expected = model.smooth(blank, time=seconds, **FEW_STEPS)
         # Rows that nobody saw are filled in, and less certain.
         assert np.isfinite(expected.alpha).all()
-        assert (expected.alpha_std[63] > expected.alpha_std[30]).all()
-
-    def test_times_with_a_zone(self):
-        hours = pd.date_range("2024-03-30", periods=60, freq="h", tz="Europe/Berlin")
-        kinds = list(hours.to_pydatetime()), pd.Series(hours), hours
-        (model, table), seconds = waving_model(), 3600.0 * np.arange(60)
-        expected, *found = (
-            model.smooth(table[:60], time=each, **FEW_STEPS).alpha
-            for each in (seconds, *kinds)
-        )
-        assert_allclose(found, [expected] * 3, atol=1e-12)
+        assert (expected.alpha_std[39] > expected.alpha_std[20]).all()
+        # Hours before and after a change of the clocks
+        dates = pd.date_range("2024-03-30", periods=60, freq="h", tz="Europe/Berlin")
+        dates = dates[kept]
+        utc = dates.tz_convert(None).to_numpy()
+        for time in (utc, pd.Series(dates), list(dates.to_pydatetime())):
+            found = model.smooth(table[kept], time=time, **FEW_STEPS)
+            assert_allclose(found.alpha, expected.alpha[kept], atol=1e-12)
+            assert_allclose(found.time_scales, expected.time_scales)
 
     def test_uneven_times_are_rounded_but_stay_apart(self):
         model, table = waving_model()
-        time = np.r_[0.0, 0.9, 2.0, 2.2, 4.3 + np.arange(96)]
+        time = np.r_[0.0, 0.9, 2.0, 2.2, 4.3 + np.arange(56)]
         found = model.smooth(table, time=time, **FEW_STEPS)
-        expected = model.smooth(table, time=np.r_[0:4, 5:101], **FEW_STEPS)
+        expected = model.smooth(table, time=np.r_[0:4, 5:61], **FEW_STEPS)
         assert_allclose(found.alpha, expected.alpha, atol=1e-12)
 
     def test_nothing_goes_from_group_to_group(self):
         model, table = waving_model()
-        groups = np.repeat(["a", "b"], 50)
+        groups = np.repeat(["a", "b"], 30)
         found = model.smooth(table, groups=groups, **FEW_STEPS)
-        mixed = np.argsort(np.tile(np.arange(50), 2), kind="stable")
+        mixed = np.argsort(np.tile(np.arange(30), 2), kind="stable")
         other = model.smooth(table[mixed], groups=groups[mixed], **FEW_STEPS)
         assert_allclose(other.alpha, found.alpha[mixed], atol=1e-10)
 
     def test_frames_of_four_points_have_no_weight(self):
         model, table = waving_model()
         few, blank = tracks_of(table.copy()), table.copy()
-        few[50, 4:], blank[50] = np.nan, np.nan
+        few[30, 4:], blank[30] = np.nan, np.nan
         found, expected = (
             model.smooth(X, **FEW_STEPS).alpha for X in (table_of(few), blank)
         )
@@ -336,7 +314,7 @@ class TestSmooth:
 
     def test_groups_without_points_have_no_coefficients(self):
         model, table = waving_model()
-        groups = np.repeat([0, 1], [70, 30])
+        groups = np.repeat([0, 1], [40, 20])
         unseen = np.where(groups[:, None] == 1, np.nan, table)
         found = model.smooth(unseen, groups=groups, **FEW_STEPS)
         assert found.time_scales.shape == (2,)

@@ -16,7 +16,7 @@ from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
 from refusals import refusals_of, warned
-from scenes import table_of, tracks_of, waving_scene, with_gaps
+from scenes import table_of, tracks_of, with_gaps
 from sklearn.base import clone
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
@@ -30,9 +30,6 @@ from isa_nrsfm.metrics import affine_shape_error
 # Of the start, which the joint refinement does not say.
 pytestmark = start_may_not_converge
 
-CAMERAS = pytest.mark.parametrize(
-    "camera", slow_after(1, ["weak_perspective", "affine"])
-)
 N_FRAMES, N_POINTS, K = 60, 20, 2
 
 
@@ -45,10 +42,10 @@ class Noisy(NamedTuple):
 
 
 @made_once
-def noisy(seed=0, n_points=N_POINTS):
+def noisy(n_points=N_POINTS):
     """Return a table with 1 percent noise, and 30 percent at two of five points."""
-    scene = make_nonrigid_tracks(N_FRAMES, n_points, K, random_state=seed)
-    rng = np.random.default_rng(seed)
+    scene = make_nonrigid_tracks(N_FRAMES, n_points, K, random_state=0)
+    rng = np.random.default_rng(0)
     size = np.std(scene.tracks - scene.tracks.mean(axis=1, keepdims=True), axis=(1, 2))
     deviation = np.where(rng.random((N_FRAMES, n_points)) < 0.4, 0.3, 0.01)
     noise = rng.normal(size=scene.tracks.shape)
@@ -62,11 +59,10 @@ def estimator(**params):
 
 
 @made_once
-def fitted(camera="affine", seed=0, weighted=True, n_points=N_POINTS):
+def fitted(camera="affine", weighted=True, n_points=N_POINTS):
     """Return the fit of `noisy`."""
-    X, weights, _ = noisy(seed, n_points)
-    weights = weights if weighted else None
-    return estimator(camera=camera).fit(X, point_weight=weights)
+    X, weights, _ = noisy(n_points)
+    return estimator(camera=camera).fit(X, point_weight=weights if weighted else None)
 
 
 def without_some():
@@ -88,14 +84,13 @@ def assert_same_fit(found, expected):
 
 
 class TestMeaning:
-    @CAMERAS
+    @pytest.mark.parametrize("camera", slow_after(1, ["affine", "weak_perspective"]))
     def test_weights_of_one_change_no_bit(self, camera):
         X, ones = noisy().X, np.ones((N_FRAMES, N_POINTS))
         expected = fitted(camera, weighted=False)
-        found = estimator(camera=camera).fit(X, point_weight=ones)
-        assert_same_fit(found, expected)
+        assert_same_fit(estimator(camera=camera).fit(X, point_weight=ones), expected)
         for method in ("transform", "score"):
-            with_ones = getattr(found, method)(X, point_weight=ones)
+            with_ones = getattr(expected, method)(X, point_weight=ones)
             assert_array_equal(with_ones, getattr(expected, method)(X))
 
     @pytest.mark.parametrize(
@@ -132,18 +127,15 @@ class TestMeaning:
         assert_allclose(model.alpha_, fitted().alpha_, atol=1e-3)
 
 
-WEIGHTED_FITS = [("weak_perspective", 0, N_POINTS), ("affine", 0, 320)]
-WEIGHTED_FITS += [(camera, 1, N_POINTS) for camera in ("weak_perspective", "affine")]
-
-
 class TestAccuracy:
     @pytest.mark.parametrize(
-        ("camera", "seed", "n_points"), slow_after(2, WEIGHTED_FITS)
+        ("camera", "n_points"),
+        slow_after(2, [("affine", 20), ("affine", 320), ("weak_perspective", 20)]),
     )
     @pytest.mark.filterwarnings("ignore:the table has outliers")  # without weights
-    def test_weighted_fits_have_less_error(self, camera, seed, n_points):
-        X, _, shapes = noisy(seed, n_points)
-        model, plain = (fitted(camera, seed, each, n_points) for each in (True, False))
+    def test_weighted_fits_have_less_error(self, camera, n_points):
+        X, _, shapes = noisy(n_points)
+        model, plain = (fitted(camera, each, n_points) for each in (True, False))
         found = model.mean_shape_ + np.tensordot(model.alpha_, model.basis_, 1)
         # Errors of 0.4 to 1 % with weights, and 5 to 8 % without them
         error = affine_shape_error(shapes, found)
@@ -161,9 +153,7 @@ class TestAccuracy:
 # Without weights the noise of the points is larger than that of the fit.
 @pytest.mark.filterwarnings("ignore:the points of X lie")
 class TestMethods:
-    @pytest.mark.parametrize(
-        "camera", slow_after(1, ["weak_perspective", "affine", "orthographic"])
-    )
+    @pytest.mark.parametrize("camera", ["affine", "weak_perspective"])
     def test_agree_with_the_fit(self, camera):
         model, (X, weights, _) = fitted(camera), noisy()
         alpha = model.transform(X, point_weight=weights)
@@ -172,13 +162,18 @@ class TestMethods:
         assert_allclose(found.motion, model.motion_, atol=1e-9)
         assert_allclose(found.translation, model.translation_, atol=1e-9)
         assert_allclose(found.alpha_std, model.alpha_std_, rtol=1e-6)
+        # In no order of time
+        smooth = model.smooth(X, point_weight=weights)
+        assert_allclose(smooth.alpha, alpha, atol=1e-9)
+        assert_allclose(smooth.alpha_std, model.alpha_std_, rtol=1e-6)
         alone = model.transform(X[4:5], point_weight=weights[4:5])
         assert_allclose(alone[0], alpha[4], atol=1e-9)
         assert np.abs(model.transform(X) - alpha).max() > 0.1
-        fresh = clone(model).fit_transform(X, point_weight=weights)
-        assert_array_equal(fresh, model.alpha_)
-        unkept = clone(model).set_params(keep_frames=False)
-        assert_array_equal(unkept.fit_transform(X, point_weight=weights), alpha)
+
+    def test_fits_that_keep_no_frames(self):
+        (X, weights, _), unkept = noisy(), estimator(keep_frames=False)
+        expected = fitted().transform(X, point_weight=weights)
+        assert_array_equal(unkept.fit_transform(X, point_weight=weights), expected)
 
     def test_cameras_depend_on_ratios_of_tiny_weights(self):
         few, tiny = (
@@ -194,10 +189,9 @@ class TestMethods:
         assert model.score(X) < -0.01
         assert model.score(X, point_weight=rng.permuted(weights, axis=1)) < -0.01
 
-    @CAMERAS
-    def test_frames_with_weights_are_frames_with_repeated_points(self, camera, rng):
+    def test_frames_with_weights_are_frames_with_repeated_points(self, rng):
         """For all that is computed of a frame: the linearisation, errors of depths."""
-        frames = fitted(camera)._model.frames
+        frames = fitted("weak_perspective")._model.frames
         frames = replace(frames, certainty=fitted()._model.frames.certainty)
         counts = rng.integers(0, 4, N_POINTS)
         many = np.repeat(np.arange(N_POINTS), counts)
@@ -215,10 +209,9 @@ class TestMethods:
         for name in ("motion", "alpha", "covariance", "precision"):
             found_here, here = getattr(found, name), getattr(expected, name)
             assert_allclose(found_here, here, rtol=1e-5, atol=1e-7 * np.abs(here).max())
-        if camera != "affine":
-            found = depth_deviations(frames, rows, sizes, weights)
-            expected = depth_deviations(repeated, rows[:, :, many], sizes)
-            assert_allclose(found[:, many], expected, rtol=1e-5)
+        found = depth_deviations(frames, rows, sizes, weights)
+        expected = depth_deviations(repeated, rows[:, :, many], sizes)
+        assert_allclose(found[:, many], expected, rtol=1e-5)
 
     def test_all_methods_leave_out_points_of_weight_zero(self):
         model, X = fitted("weak_perspective"), noisy().X
@@ -235,23 +228,6 @@ class TestMethods:
                 call(X, point_weight=weights), call(holed), strict=True
             ):
                 assert_array_equal(found, expected)
-
-    @pytest.mark.slow
-    def test_smoothed_coefficients_are_those_of_weighted_frames(self, rng):
-        """Frames with noise of ten times the deviation have the weight 1/100."""
-        scene, alpha = waving_scene(100, N_POINTS, [0.1, 0.07])
-        tracks = scene.tracks
-        deviation = np.where(rng.random(100) < 0.3, 0.2, 0.02) * tracks.std()
-        tracks += deviation[:, None, None] * rng.normal(size=tracks.shape)
-        X = tracks.reshape(100, -1)
-        weights = np.tile((deviation.min() / deviation) ** 2, (N_POINTS, 1)).T
-        model = estimator(scale_frames=False).fit(X, point_weight=weights)
-        truth = np.linalg.lstsq(model.alpha_, alpha)[0]
-        found = [
-            np.std(model.smooth(X, **options).alpha @ truth - alpha)
-            for options in ({"point_weight": weights}, {})
-        ]
-        assert found[0] < 0.8 * found[1]
 
 
 class TestRouting:
@@ -340,7 +316,6 @@ def test_all_results_of_some_points_are_weighted(tmp_path, succeeds):
     assert report["held_out_error"] == pytest.approx(expected, rel=1e-4)
     smooth = model.smooth(X, time=np.arange(N_FRAMES) / 25, **weights)
     assert_allclose(table["alpha_1_smooth"], smooth.alpha[:, 0], atol=1e-6)
-    assert_allclose(frame_poses(model).yaw, poses.yaw, atol=1e-6)
     saved, new = tmp_path / "out" / "model.npz", tmp_path / "new.csv"
     succeeds("transform", saved, results, *options[:2], "-o", new)
     again = pd.read_csv(new)[["alpha_1", "alpha_2"]]

@@ -13,8 +13,6 @@ from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.export import point_distances
 from isa_nrsfm.io import load_model, save_model
 
-# The starts of users lead to the cameras that turn as far as the faces do.
-AS_USERS = ["few_frames", "widths"]
 CALIBRATED = {"camera": "weak_perspective", "random_state": 0}
 
 
@@ -100,9 +98,9 @@ def test_all_results_have_the_same_coefficients(model, table, tmp_path):
     loaded = load_model(tmp_path / "model.npz")
     for other in (model.mirrored(), loaded, loaded.mirrored()):
         assert_allclose(other.transform(table), model.transform(table), atol=1e-9)
-    smooth = model.smooth(table)  # photos in any order: as they are
-    assert_allclose(smooth.alpha, model.transform(table), atol=1e-9)
-    fit = model.decompose(table)
+    photos = table[:30]  # in any order: as they are
+    smooth, fit = model.smooth(photos), model.decompose(photos)
+    assert_allclose(smooth.alpha, model.transform(photos), atol=1e-9)
     assert_allclose(smooth.decomposition.alpha, fit.alpha, atol=1e-9)
     options = CALIBRATED | {"keep_frames": False, "refinement": None}
     single, X = AffineNRSfM(2, remove_pose=True, **options), table.astype("f4")
@@ -125,7 +123,8 @@ def test_a_prior_keeps_its_origin(plain):
 
 
 def test_what_would_not_be_removed_is_not_advised(table):
-    turned = table.reshape(60, -1, 2)[:, :, ::-1].reshape(60, -1)  # yaw is pitch
+    # Yaw is pitch.
+    turned = table.reshape(60, -1, 2)[:, ::2, ::-1].reshape(60, -1)
     found = Quick(2, **CALIBRATED).fit(turned).diagnostics()
     assert found.pose_share.max() > 0.3
     assert found.messages[-1].endswith("compare coefficients of similar views only")
