@@ -27,7 +27,7 @@ from hypothesis.stateful import (
 )
 from interrupts import interrupted_after
 from layers import slow_after
-from numpy.testing import assert_allclose, assert_array_equal, assert_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refused
 from scenes import with_gaps
 from sklearn.base import clone
@@ -51,10 +51,7 @@ def replaced(X, place, value):
     return X
 
 
-def names_of(X):
-    return [f"{axis}_{j}" for j in range(X.shape[1] // 2) for axis in "xy"]
-
-
+NAMES = [f"{axis}_{j}" for j in range(13) for axis in "xy"]
 # What is done to tables that a fit takes as they are, and that it refuses.
 KINDS = {
     "plain": lambda X, rng: X,
@@ -62,7 +59,7 @@ KINDS = {
     "noise": lambda X, rng: rng.normal(size=X.shape),
     "integers": lambda X, rng: rng.integers(0, 3, X.shape),
     "rigid": lambda X, rng: X[0] + 0.01 * rng.normal(size=X.shape),
-    "named": lambda X, rng: pd.DataFrame(X, columns=names_of(X)),
+    "named": lambda X, rng: pd.DataFrame(X, columns=NAMES[: X.shape[1]]),
     "single precision": lambda X, rng: X.astype(np.float32),
     "far": lambda X, rng: X + 1e6,
     "large": lambda X, rng: X * 1e100,
@@ -118,11 +115,6 @@ def only_own_warnings():
         yield
 
 
-def rows(X, which):
-    """Return rows of an array or a DataFrame."""
-    return X.iloc[which] if isinstance(X, pd.DataFrame) else X[which]
-
-
 def assert_not_fitted(model, X, folder):
     """Assert that an estimator does nothing that needs a fit, and says so."""
     tables = ("transform", "decompose", "reconstruct", "reproject", "score")
@@ -137,10 +129,6 @@ def assert_not_fitted(model, X, folder):
 
 def pickled(model):
     return pickle.loads(pickle.dumps(model))
-
-
-def arrays_of(model):
-    return {name: v for name, v in vars(model).items() if isinstance(v, np.ndarray)}
 
 
 class Estimator(RuleBasedStateMachine):
@@ -225,8 +213,9 @@ class Estimator(RuleBasedStateMachine):
         loaded = load_model(path)
         path.unlink()
         assert str(loaded.get_params()) == str(self.model.get_params())
-        found, expected = (arrays_of(each) for each in (loaded, self.model))
-        assert_equal(found, expected)
+        for name, value in vars(self.model).items():
+            if isinstance(value, np.ndarray):
+                assert_array_equal(getattr(loaded, name), value)
         # A file has the stability in place of the fits of halves that it follows from.
         self.attributes = set(vars(self.model)) - {"_halves", "_stability"}
         self.model = loaded
@@ -235,11 +224,11 @@ class Estimator(RuleBasedStateMachine):
     @rule(row=st.integers(0, 9))
     def rows_by_themselves(self, row):
         row %= len(self.X)
-        with only_own_warnings():
-            alone = self.model.transform(rows(self.X, slice(row, row + 1)))
-            part = self.model.transform(rows(self.X, slice(row, row + 3)))
-        assert_allclose(alone[0], self.alpha[row], rtol=0, atol=ROUNDING)
-        assert_allclose(part, self.alpha[row : row + 3], rtol=0, atol=ROUNDING)
+        for n_rows in (1, 3):
+            rows = slice(row, row + n_rows)
+            with only_own_warnings():
+                alpha = self.model.transform(self.X[rows])  # also of a DataFrame
+            assert_allclose(alpha, self.alpha[rows], rtol=0, atol=ROUNDING)
 
     @invariant()
     def whole_or_not_at_all(self):
@@ -261,45 +250,6 @@ class Estimator(RuleBasedStateMachine):
             if numbers and name != "mirror_certainty_":
                 per_frame = np.shape(value)[:1] == shown.shape
                 assert np.isfinite(value[shown] if per_frame else value).all(), name
-
-
-def test_frames_that_are_equal_support_one_basis_shape():
-    X = table("equal frames", 42272)
-    model = AffineNRSfM("auto", loss="huber", scale_frames=False, random_state=0)
-    with only_own_warnings():
-        model.fit(X)
-    assert len(model.basis_) == 1
-    assert_allclose(model.reproject(X), X, rtol=0, atol=1e-6)
-
-
-def test_frames_whose_points_lie_in_a_plane_of_the_object_are_refused():
-    rng = np.random.default_rng(2)
-    mean_shape, basis = rng.normal(size=(12, 3)), 0.3 * rng.normal(size=(12, 3))
-    mean_shape[:5, 2] = basis[:5, 2] = 0.0
-    alpha, motion = rng.normal(size=60), rng.normal(size=(60, 2, 3))
-    shapes = mean_shape + alpha[:, None, None] * basis
-    pairs = shapes @ motion.swapaxes(1, 2)
-    pairs[3, 5:] = np.nan
-    X = np.vstack([np.full((1, 24), np.nan), pairs.reshape(60, -1)])
-    with (
-        pytest.warns(UserWarning, match="no point is visible"),
-        pytest.raises(ValueError, match=r"\(first: row 4\) are coplanar"),
-    ):
-        AffineNRSfM(1, random_state=0).fit(X)
-
-
-@pytest.mark.parametrize("kind", ["constant frame", "few frames"])
-def test_a_refusal_that_is_interrupted_leaves_nothing(kind):
-    X = table(kind, 0)
-    for n_lines in range(1, 150):
-        model = AffineNRSfM(1, max_iter=3, random_state=0)
-        with (
-            pytest.raises((KeyboardInterrupt, ValueError)),
-            only_own_warnings(),
-            interrupted_after(n_lines, ESTIMATOR),
-        ):
-            model.fit(X)
-        assert not [name for name in vars(model) if name.endswith("_")]
 
 
 FEW = settings(max_examples=3, stateful_step_count=4)

@@ -29,12 +29,12 @@ CHECKS_OF_RESULTS = (
 
 def joint():
     """Return an estimator of the joint refinement, of few steps for speed."""
-    return AffineNRSfM(n_components=1, max_iter=3)
+    return AffineNRSfM(1, isa=FastISA(n_init=1), max_iter=3)
 
 
 def alternating():
     """Return an estimator of the other strategy and refinement."""
-    return AffineNRSfM(n_components=2, isa=FastISA(n_init=1), refinement="alternating")
+    return AffineNRSfM(1, isa=FastISA(n_init=1), refinement="alternating")
 
 
 def search(refinement):
@@ -63,12 +63,6 @@ def test_results_of_the_joint_refinement(name, landmark_tables):
     getattr(estimator_checks, name)("AffineNRSfM", joint())
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", [CHECKS_OF_RESULTS[i] for i in (1, 2, 7)])
-def test_results_of_a_search_with_the_joint_refinement(name, landmark_tables):
-    getattr(estimator_checks, name)("AffineNRSfMCV", search("joint"))
-
-
 # The checks of dataframe output mix tables with and without names.
 @pytest.mark.filterwarnings("ignore:X does not have valid feature names:UserWarning")
 @pytest.mark.filterwarnings("ignore:X has feature names:UserWarning")
@@ -76,9 +70,7 @@ def test_results_of_a_search_with_the_joint_refinement(name, landmark_tables):
 @pytest.mark.parametrize("searched", slow_after(1, [False, True]))
 def test_extra_checks_on_landmark_tables(name, searched, landmark_tables):
     # Names, dataframes and parameters have nothing to do with the way of fitting.
-    estimator = search(None)
-    if not searched:
-        estimator = estimator.estimator.set_params(n_components=1)
+    estimator = search(None) if searched else alternating().set_params(refinement=None)
     getattr(estimator_checks, name)(type(estimator).__name__, estimator)
 
 

@@ -6,19 +6,18 @@ Attributes and methods are those of the page of conventions and of the docstring
 import inspect
 import re
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from layers import Quick, slow_after, start_may_not_converge
 from numpy.testing import assert_allclose
+from project import text
 from scipy.spatial.transform import Rotation
 from sklearn.base import BaseEstimator, TransformerMixin
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "conventions.md"
 # The second table is the first one times ten, turned, and moved.
 TIMES, PLACE = 10.0, np.array([300.0, -200.0])
 TURN = Rotation.from_rotvec([0.0, 0.0, 0.4]).as_matrix()
@@ -50,7 +49,7 @@ MATRICES = {"motion", "reference_motion", "rotations", "rotation_covariance"}
 
 def units():
     """Return the rows of the page's table: a word for each column, by attribute."""
-    section = PAGE.read_text(encoding="utf-8").partition("## Units of the attributes")
+    section = text("docs/conventions.md").partition("## Units of the attributes")
     rows = {}
     for line in section[2].partition("\n## ")[0].splitlines():
         if line.startswith("| `"):
@@ -63,7 +62,7 @@ def table(camera):
     """Return a table that such cameras see."""
     camera = camera if camera == "orthographic" else "weak_perspective"
     options = {"n_components": 2, "noise": 0.01, "camera": camera, "random_state": 0}
-    return make_face_tracks(40, **options).tracks[:, ::4].reshape(40, -1)
+    return make_face_tracks(24, **options).tracks[:, ::5].reshape(24, -1)
 
 
 def changed(name, value, factor):
@@ -116,7 +115,7 @@ def test_the_page_has_all_attributes():
 
 # The paper's pipeline says so of tables with as few points as this one.
 @start_may_not_converge
-@pytest.mark.parametrize("refinement", slow_after(1, ["joint", "alternating", None]))
+@pytest.mark.parametrize("refinement", slow_after(1, ["joint", "alternating"]))
 @pytest.mark.parametrize("column", slow_after(1, [2, 4, 0, 1, 3]))
 def test_attributes(column, refinement):
     settings = COLUMNS[column] | {"refinement": refinement}
@@ -201,21 +200,10 @@ def public_methods():
 
 
 @start_may_not_converge
-@pytest.mark.parametrize("refinement", ["joint", None])
-def test_orthographic_shapes_have_the_size_of_their_images(refinement):
-    settings = {"camera": "orthographic", "refinement": refinement}
-    model, X = fitted(**settings), table("orthographic")
-    M, (_, translation, alpha, *_) = model.motion_, model.decompose(X)
-    assert_allclose(M @ M.mT, np.tile(np.eye(2), (len(X), 1, 1)), atol=1e-9)
-    images = X.reshape(len(X), -1, 2) - translation[:, None]
-    residual = images - model.shapes(alpha) @ M.mT
-    assert np.linalg.norm(residual) < 0.1 * np.linalg.norm(images)
-
-
 def test_orthographic_cameras_do_not_scale_frames():
     # So that one column of the page is enough.
-    settings = {"camera": "orthographic", "refinement": "joint"}
-    scaled, other = (fitted(**settings, **each) for each in ({}, SCALED[1]))
+    settings = {"camera": "orthographic", "refinement": None}
+    scaled, other = (fitted(**settings, **each) for each in SCALED)
     for name in units():
-        values = getattr(scaled, name), getattr(other, name)
-        np.testing.assert_array_equal(*values, err_msg=name)
+        values = (getattr(model, name, None) for model in (scaled, other))
+        np.testing.assert_equal(*values, err_msg=name)
