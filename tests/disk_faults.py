@@ -30,14 +30,13 @@ def interrupt(_path=None):
     raise KeyboardInterrupt
 
 
-# By name: what happens, at which later operations it happens again, and whether it
-# happens after the operation instead of before it. A killed process does nothing more.
+# By name: what happens instead of an operation, and at which later operations it
+# happens again. A killed process does nothing more.
 STRIKES = {
-    "disk full": (disk_error(errno.ENOSPC), "writes", False),
-    "access denied": (disk_error(errno.EACCES), "none", False),
-    "interrupted before": (interrupt, "none", False),
-    "interrupted after": (interrupt, "none", True),
-    "killed": (interrupt, "all", False),
+    "disk full": (disk_error(errno.ENOSPC), "writes"),
+    "access denied": (disk_error(errno.EACCES), "none"),
+    "interrupted": (interrupt, "none"),
+    "killed": (interrupt, "all"),
 }
 
 
@@ -46,14 +45,8 @@ class Faults:
 
     def __init__(self, folder, strike, at):
         self.folder = os.path.realpath(folder)
-        self.strike, self.again, self.after = STRIKES[strike]
-        self.stops = self.strike is interrupt
+        self.strike, self.again = STRIKES[strike]
         self.at, self.operations = at, []
-
-    @property
-    def struck(self):
-        """Whether there were as many operations."""
-        return 0 < self.at <= len(self.operations)
 
     def concerns(self, *paths, dir_fd=None, **_):
         """Tell whether an operation is on files of the folder."""
@@ -65,15 +58,9 @@ class Faults:
         self.operations.append((name, *map(str, args[:2])))
         number = len(self.operations)
         again = self.again == "all" or (self.again == "writes" and full)
-        strikes = number == self.at or (again and number > self.at > 0)
-        if strikes and not self.after:
+        if number == self.at or (again and number > self.at):
             self.strike(*args[:1])
-        result = operation(*args, **keywords)
-        if strikes and self.after:
-            if isinstance(result, io.FileIO):  # which nobody else has yet
-                io.FileIO.close(result)
-            self.strike(*args[:1])
-        return result
+        return operation(*args, **keywords)
 
 
 @contextlib.contextmanager
@@ -92,12 +79,12 @@ def disk_faults(folder, strike, at):
     strike : str
         A key of `STRIKES`.
     at : int
-        The number of the operation, from 1; with 0 none fails.
+        The number of the operation, from 1.
 
     Yields
     ------
     Faults
-        With `struck`, whether there were as many, and `operations`.
+        With `operations`, which were tried.
     """
     faults = Faults(folder, strike, at)
     real_open = io.open
@@ -149,7 +136,7 @@ def disk_faults(folder, strike, at):
     with pytest.MonkeyPatch.context() as patch:
         for module in (io, builtins):
             patch.setattr(module, "open", counting_open)
-        for name in WRITING + CLEANING * faults.stops:
+        for name in WRITING + CLEANING * (faults.strike is interrupt):
             patch.setattr(os, name, counting(name))
         yield faults
 

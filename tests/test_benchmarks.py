@@ -38,23 +38,22 @@ COMMANDS = [
 OK = pd.DataFrame({"status": "ok", "message": "", "error": [0.1, 0.3, 0.2]})
 LATE = pd.DataFrame({"status": ["over time"], "message": "over 60 s"})
 WRONG = pd.DataFrame({"status": ["error"], "message": "ValueError: no"})
-ENDS = [(-1, "over time", {}, "over 0.5 s"), (3, "ok", {"square": 9}, "")]
-ENDS += [("a", "error", {}, "TypeError: '<' not supported between instances of")]
+ENDS = [(-1, "over time", "over 0.5 s"), ("a", "error", "TypeError: '<' not supported")]
 
 
+@pytest.mark.slow
 @pytest.mark.subprocess
-@pytest.mark.parametrize(("x", "status", "values", "message"), slow_after(1, ENDS))
-def test_runs_in_a_process_of_their_own_end(x, status, values, message):
+@pytest.mark.parametrize(("x", "status", "message"), ENDS)
+def test_runs_in_a_process_of_their_own_end(x, status, message):
     record = run_isolated(measured_square, {"x": x}, time_limit=0.5)
-    assert (record["status"], record["values"]) == (status, values)
+    assert (record["status"], record["values"], record["seconds"]) == (status, {}, None)
     assert record["message"].startswith(message)
-    assert (record["seconds"] is None) == (status != "ok")
 
 
 @pytest.fixture(scope="module")
 def tracks():
     options = {"camera": "orthographic", "noise": 0.01, "random_state": 0}
-    return make_nonrigid_tracks(60, 30, 2, **options)
+    return make_nonrigid_tracks(40, 30, 2, **options)
 
 
 @pytest.mark.parametrize("name", ["drink", "synthetic"])
@@ -65,7 +64,7 @@ def test_true_shapes_and_cameras_have_no_error(tracks, name):
     mirror = np.diag([1.0, 1.0, -1.0])
     turn, affinity = random_rotation(1) @ mirror, np.triu(np.ones((3, 3)))
     shapes = {"affine": tracks.shapes @ affinity, "euclidean": tracks.shapes @ turn / 2}
-    cameras = {"rotations": mirror @ rotations @ turn, "scales": np.full(60, 2.0)}
+    cameras = {"rotations": mirror @ rotations @ turn, "scales": np.full(40, 2.0)}
     found = Found(tracks.data, **shapes, **cameras)
     errors = _fits.errors_3d(SETS[name], tracks.shapes @ rotations.mT, found)
     assert set(errors) == {"sequence_error", "frame_error"}
@@ -98,11 +97,13 @@ def test_errors_of_shapes_leave_out_their_rotations_and_a_mirror_image(rng):
     turned = np.stack([S @ random_rotation(i, 3) for i, S in enumerate(truth)])
     mirrored = turned * [1.0, 1.0, -1.0] + 3.0
     assert questions.turned_error(mirrored, truth) == pytest.approx(0.0, abs=1e-12)
-    # Not of single frames, and not a scale.
+    # Not of single frames.
     mirrored[0] *= [1.0, 1.0, -1.0]
     assert questions.turned_error(mirrored, truth) > 0.02
-    centred = truth - truth.mean(axis=1, keepdims=True)
-    assert questions.turned_error(1.1 * centred, truth) == pytest.approx(0.1)
+    shapes = [(i + 1) * truth[0] @ random_rotation(i, 3) + i for i in range(4)]
+    common = [real.common_shape(shapes)]
+    error = mean_shape_error_3d(truth[:1], common, convention="frame")
+    assert error == pytest.approx(0.0, abs=1e-12)
 
 
 def test_views_are_told_by_the_turn_from_the_front():
@@ -110,9 +111,12 @@ def test_views_are_told_by_the_turn_from_the_front():
     backwards = np.diag([1.0, -1.0, -1.0])  # y down and z away from the viewer
     for rotations in (yaws, backwards @ yaws @ backwards, yaws @ backwards):
         views = questions.views_of(rotations)
-        found = [np.flatnonzero(views[name]).tolist() for name in ("near", "frontal")]
-        assert found == [[0], [0, 1]]
-        assert np.flatnonzero(views["turned"]).tolist() == [2, 3]
+        found = {name: np.flatnonzero(views[name]).tolist() for name in views}
+        assert (found["near"], found["frontal"], found["turned"]) == (
+            [0],
+            [0, 1],
+            [2, 3],
+        )
         assert {np.argmax(views["left"]), np.argmax(views["right"])} == {2, 3}
 
 
@@ -120,23 +124,13 @@ def test_turns_and_shares_of_cameras(rng):
     turn = Rotation.from_rotvec([[0, 0, 0], [0, 0.3, 0], [0.1, 0, 0]]).as_matrix()
     pose = Rotation.from_rotvec(rng.normal(size=(20, 3))).as_matrix()
     rotations = (turn @ pose[:, None]).reshape(-1, 3, 3)
-    degrees = np.degrees([0.3, 0.1])
-    np.testing.assert_allclose(real.turns(rotations, 3, 0), degrees)
-    steps = np.array([[0, 0], [0, 3], [0, 6]])
-    alpha = rng.normal(size=(20, 1, 2)) + steps
-    first, second = real.camera_share(alpha.reshape(-1, 2), 3)
-    assert first == pytest.approx(0.0)
-    assert second == pytest.approx(6 / alpha[..., 1].var())
+    np.testing.assert_allclose(real.turns(rotations, 3, 0), np.degrees([0.3, 0.1]))
+    alpha = rng.normal(size=(20, 1, 2)) + np.array([[0, 0], [0, 3], [0, 6]])
+    shares = real.camera_share(alpha.reshape(-1, 2), 3)
+    assert list(shares) == pytest.approx([0.0, 6 / alpha[..., 1].var()])
 
 
-def test_common_shape_does_not_depend_on_size_and_rotation(rng):
-    shape = rng.normal(size=(20, 3))
-    shapes = [(i + 1) * shape @ random_rotation(i, 3) + i for i in range(4)]
-    common = [real.common_shape(shapes)]
-    error = mean_shape_error_3d([shape], common, convention="frame")
-    assert error == pytest.approx(0.0, abs=1e-12)
-
-
+@pytest.mark.slow
 @pytest.mark.subprocess
 def test_command_measures_writes_and_rewrites(tmp_path, capsys):
     chosen = ["truth", "--sets", "synthetic", "--methods", "rigid"]
@@ -166,29 +160,7 @@ def test_stored_results_give_every_page():
         assert page.count("\n| ") > 3
 
 
-def test_runs_of_the_paper_leave_out_what_takes_too_long():
-    runs = _paper.runs(list(_paper.PRINTED), _paper.PAPER.methods, 3)
-    fits = [run[:3] for run in runs if run[3]["part"] == "fit"]
-    dense = {method for name, method, _ in fits if name == "ict_dense"}
-    assert dense == {*_paper.PAPER.methods} - {"pi", "bmm", "kong_lucey"}
-    assert fits.count(("shark", "isa1", 2)) == 1
-    assert ("ict_dense", "isa1", 1) not in fits
-    assert not [fit for fit in fits if fit[1] == "floor" and fit[2]]
-
-
-def test_random_mixing_spoils_blocks_unless_energies_are_equal():
-    for even in (np.ones(9), [5.0, 2.0, 1.0]):
-        assert _paper.turned_at_random(even) == pytest.approx(0.0, abs=1e-10)
-    # One direction alone: w w^T of a random unit vector has 2 / 3 outside its blocks
-    # where these are even, and less where they are not.
-    assert 30 < _paper.turned_at_random([1.0] + 8 * [0.0]) < 200 / 3
-
-
-CHOICES = [
-    ("numbers", "isa2", 1),
-    ("starts", "isa1", 2),
-    ("recoveries", "isa2", "irls"),
-]
+CHOICES = [("starts", "isa1", 2), ("recoveries", "isa2", "irls")]
 
 
 @pytest.mark.parametrize(("part", "method", "choice"), CHOICES)

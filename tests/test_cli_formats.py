@@ -6,15 +6,14 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from fit_runs import told
-from layers import slow_after
+from fit_runs import MODEL, told
 from refusals import refusals_of
 
 from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import find_format  # noqa: F401  in refusals.txt
 
-N_FRAMES = 40
+N_FRAMES = 32
 LOST, EMPTY = 3, 7
 QUICK = "-k 1 --isa fast --n-init 2 --refinement none --no-figures".split()
 
@@ -40,11 +39,6 @@ def write_openface(folder):
     return path, ["--min-confidence", "0.5"], kept, empty
 
 
-def write_mediapipe(folder):
-    path = files.write_mesh(folder / "mesh.csv", tracks(478))
-    return path, ["--image-size", "640x480"], {"code"}, []
-
-
 def write_pts(folder):
     return files.write_pts(folder / "300W", tracks(68)), [], {"file"}, []
 
@@ -59,10 +53,7 @@ def write_openpose(folder):
     return path, options, {"file", "frame", "person"}, [EMPTY]
 
 
-FILES = [write_openface, write_openpose, write_mediapipe]
-
-
-@pytest.mark.parametrize("write", slow_after(2, FILES))
+@pytest.mark.parametrize("write", [write_openface, write_openpose])
 def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
     path, options, kept, empty = write(tmp_path)
     found = fits(path, *options, *QUICK, folder=tmp_path / "results")
@@ -75,7 +66,7 @@ def test_files_are_fitted_and_transformed(write, fits, transforms, tmp_path):
     assert "x_0" not in alpha
     missing = alpha["alpha_1"].isna()
     assert list(alpha["frame" if "frame" in alpha else "row"][missing]) == empty
-    assert ("1 rows: tracking failed" in found.page) == (len(empty) > 0)
+    assert "1 rows: tracking failed" in found.page
     uncertain = "1 rows: all points missing or uncertain" in found.page
     assert uncertain == (write is write_openface)
     again, _, err = transforms(found.path, path, *options)
@@ -112,18 +103,15 @@ def axis_of(written, options=""):
         told("fit", path, *options, "-o", path.parent / "out")
 
 
-def test_columns_make_any_file_a_table(fits, tmp_path):
+def test_columns_make_any_file_a_table(fits, transforms, tmp_path):
     path, *_ = write_openface(tmp_path)
     out = fits(path, "--columns", "x_#,y_#", *QUICK).page
-    assert "in 40 frames" in out
+    assert "in 32 frames" in out
     assert "x_0, y_0, x_1, y_1, ..., x_67, y_67" in out
     assert "eye_lmk_x_#,eye_lmk_y_# (56)" in out.partition("coordinates not used: ")[2]
-
-
-def test_models_transform_files_of_other_formats(fits, transforms, tmp_path):
-    model = fits(write_pts(tmp_path)[0], *QUICK).path
-    _, out, _ = transforms(model, write_openface(tmp_path)[0])
-    assert "1 rows: tracking failed" in out
+    # Models transform files of other formats.
+    alpha, *_ = transforms(tmp_path / MODEL, write_pts(tmp_path)[0])
+    assert alpha["alpha_1"].notna().all()
 
 
 def write_shares(folder, change=lambda shares: shares):

@@ -10,7 +10,7 @@ import isa_nrsfm
 from isa_nrsfm import AffineNRSfM, Decomposition, FastISA, PooledFastICA
 from isa_nrsfm.baselines import BlockMatrixNRSfM
 from isa_nrsfm.calibration import canonical_pose, deformation_metric, euclidean_frames
-from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
+from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import landmark_table, load_model, open_table, save_model
 from isa_nrsfm.metrics import affine_shape_error, inverse_snr
 from isa_nrsfm.plotting import BasisShapeDisplay
@@ -64,11 +64,7 @@ def of_misspelt_values() -> None:
 def main(folder: Path) -> float:
     faces = make_face_tracks(n_frames=100, random_state=0)
     points, _ = landmark_table(pd.read_csv(folder / "faces.csv"))
-    model = fitted(faces.data).fit(points)
-    fitted(make_nonrigid_tracks(60, 20, 2).data).fit(open_table(folder / "faces.npy"))
-    of_methods(model, faces.data, folder)
-    of_attributes(model)
-    of_calibrated_cameras(faces.data)
+    model = fitted(faces.data).fit(points).fit(open_table(folder / "faces.npy"))
     alpha: Floats = BlockMatrixNRSfM(n_components=2).fit_transform(faces.data)
     BasisShapeDisplay.from_estimator(model).plot()
     error: float = affine_shape_error(faces.shapes, model.reconstruct(faces.data))
