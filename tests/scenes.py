@@ -47,11 +47,13 @@ def random_scene(
     kind="complete",
     deformation=0.3,
     extent=(1.0, 1.0, 1.0),
+    turns=None,
 ):
     """
     Return a scene of random shapes and cameras of a model.
 
     The points are "complete", "weighted", or "missing": weighted, and NaN at some.
+    Calibrated cameras have rotation vectors of a deviation `turns`, or all rotations.
     """
     rng = np.random.default_rng(seed)
     shapes = rng.normal(size=(n_components + 1, 3, n_points))
@@ -60,7 +62,7 @@ def random_scene(
     shapes -= shapes.mean(axis=2, keepdims=True)
     motion = rng.normal(size=(n_frames, 2, 3))
     if camera != "affine":
-        motion = random_cameras(rng, n_frames)
+        motion = random_cameras(rng, n_frames, turns)
     if camera == "weak_perspective":
         motion = rng.uniform(0.5, 2.0, n_frames)[:, None, None] * motion
     translation = rng.normal(size=(n_frames, 2))
@@ -113,9 +115,12 @@ def table_of(tracks, layout="interleaved"):
     return tracks.reshape(len(tracks), -1)
 
 
-def random_cameras(rng, n_frames):
-    """Return cameras with orthonormal rows, (I, 2, 3), in all orientations."""
-    return Rotation.random(n_frames, rng).as_matrix()[:, :2]
+def random_cameras(rng, n_frames, turns=None):
+    """Return cameras with orthonormal rows, (I, 2, 3), by default all rotations."""
+    rotations = Rotation.random(n_frames, rng)
+    if turns is not None:
+        rotations = Rotation.from_rotvec(turns * rng.normal(size=(n_frames, 3)))
+    return rotations.as_matrix()[:, :2]
 
 
 class StructuredMotion(NamedTuple):
@@ -166,16 +171,9 @@ def spherical_sources(seed, n_samples, n_subspaces, size=3):
 
 def likelihood_of(tracks, weights, penalty, block_frames=2048):
     """Return the objective of the joint fit for tracks (n_frames, n_points, 2)."""
-    blocks = [
-        frame_tracks(
-            tracks[first : first + block_frames].mT,
-            None if weights is None else weights[first : first + block_frames],
-        )
-        for first in range(0, len(tracks), block_frames)
-    ]
-    lengths = [len(block.weight) for block in blocks]
-    frames = JointFrames(FrameBlocks.of_blocks(blocks, lengths))
-    return MarginalLikelihood(frames, penalty)
+    given = [] if weights is None else [weights]
+    blocks = FrameBlocks.of_array(tracks.mT, block_frames).derive(frame_tracks, *given)
+    return MarginalLikelihood(JointFrames(blocks), penalty)
 
 
 def shape_prior(scene):

@@ -1,7 +1,6 @@
 """The joint fit of a table: cameras, samples, robust losses, noise."""
 
 import warnings
-from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -28,11 +27,8 @@ EXACT = 5e-6
 
 SEEN_BY = ["weak_perspective", "affine", "orthographic"]
 EACH = pytest.mark.parametrize("camera", slow_after(1, SEEN_BY))
-CALIBRATED = pytest.mark.parametrize(
-    "camera", slow_after(1, ["weak_perspective", "orthographic"])
-)
 KINDS = pytest.mark.parametrize(
-    ("camera", "gaps"), slow_after(1, [*product(SEEN_BY, [True, False])])
+    ("camera", "gaps"), slow_after(1, [*zip(SEEN_BY, [True, False, True], strict=True)])
 )
 # Errors of depths are tested in test_frame_fit.py. The first steps are made on few
 # frames, as of large tables.
@@ -52,7 +48,7 @@ def noisy(tracks, deviation, seed=0, unit=False):
 
 def random_table(camera="weak_perspective", seed=0, deviation=DEVIATION, **options):
     """Return tracks of cameras of a model, and the true shapes of the frames."""
-    options = {"n_frames": 60, "n_points": 40, "n_components": 2} | options
+    options = {"n_frames": 40, "n_points": 24, "n_components": 2} | options
     truth = make_nonrigid_tracks(camera=camera, random_state=seed, **options)
     unit = camera == "orthographic"
     return noisy(truth.clean, deviation, seed, unit), truth.shapes
@@ -64,13 +60,6 @@ def fitted(tracks, n_components=2, kind=AffineNRSfM, **params):
 
 def error_of(model, tracks, truth):
     return affine_shape_error(truth, model.reconstruct(table_of(tracks)))
-
-
-def euclidean_error(model, tracks, truth):
-    """Return the error of shapes up to one rotation or reflection, and units."""
-    convention = "sequence" if model.camera == "orthographic" else "frame"
-    shapes = model.reconstruct(table_of(tracks))
-    return mean_shape_error_3d(truth, shapes, convention=convention, scale=True)
 
 
 @made_once
@@ -115,38 +104,35 @@ class TestCameras:
     @KINDS
     def test_noise_is_true_within_the_error_of_sampling(self, camera, gaps):
         tracks, _, model = fit_of(camera, gaps)
-        freedom = np.isfinite(tracks).sum() - 3 * 3 * 39
-        freedom -= (2 + CAMERAS[camera].n_parameters) * 60
+        freedom = np.isfinite(tracks).sum() - 3 * 3 * 23
+        freedom -= (2 + CAMERAS[camera].n_parameters) * 40
         size = np.mean(np.nanmean(tracks**2, axis=(1, 2)))
         variance = DEVIATION**2 / (1.0 if camera == "orthographic" else size)
         deviation = np.sqrt(2 / freedom)
         assert abs(model.noise_variance_ / variance - 1) < 3.5 * deviation
 
-    @CALIBRATED
-    def test_no_frame_stays_reversed(self, camera):
+    def test_no_frame_stays_reversed(self):
         # Of a thin object reversed cameras are nearly as good.
-        truth = make_nonrigid_tracks(60, 40, 2, camera=camera, random_state=0)
+        camera = "weak_perspective"
+        truth = make_nonrigid_tracks(30, 24, 2, camera=camera, random_state=0)
         frames = truth.shapes * [1.0, 1.0, 0.3]
         tracks = noisy(frames @ truth.motion.swapaxes(1, 2), 0.01, unit=True)
         model = fitted(tracks, camera=camera)
-        assert euclidean_error(model, tracks, frames) < 0.02
-
-
-ROBUST_TABLES = [("huber", 150, 40, 2, 0.15), ("cauchy", 300, 8, 1, 0.2)]
-ROBUST_TABLES.append(("huber", 150, 30, 5, 0.1))
+        shapes = model.reconstruct(table_of(tracks))
+        assert mean_shape_error_3d(frames, shapes, convention="frame") < 0.02
 
 
 class TestNoiseVariance:
     # The median is less precise, and the fit bends towards the inner half, with
     # "cauchy" most of all.
     @pytest.mark.parametrize(
-        ("loss", "n_frames", "n_points", "n_components", "largest"),
-        slow_after(1, ROBUST_TABLES),
+        ("loss", "sizes", "largest"),
+        slow_after(1, [("huber", (100, 30, 2), 0.15), ("cauchy", (300, 8, 1), 0.2)]),
     )
-    def test_with_a_robust_loss(self, loss, n_frames, n_points, n_components, largest):
-        sizes = {"n_frames": n_frames, "n_points": n_points}
-        tracks, _ = random_table("orthographic", n_components=n_components, **sizes)
-        model = fitted(tracks, n_components, loss=loss, scale_frames=False)
+    def test_with_a_robust_loss(self, loss, sizes, largest):
+        names = "n_frames", "n_points", "n_components"
+        tracks, _ = random_table("orthographic", **dict(zip(names, sizes, strict=True)))
+        model = fitted(tracks, sizes[2], loss=loss, scale_frames=False)
         assert abs(model.noise_variance_ / DEVIATION**2 - 1) < largest
 
     def test_of_images_is_that_of_residuals_for_each_free_number(self):
@@ -156,23 +142,21 @@ class TestNoiseVariance:
         found = frames.noise_variance * frames.certainty.images[0]
         assert_allclose(found, 360 * frames.certainty.residual / free, rtol=0.15)
 
-    @EACH
-    def test_of_tables_with_few_numbers_stays_finite(self, camera):
+    def test_of_tables_with_few_numbers_stays_finite(self):
         # Nearly as many unknowns as numbers: at least a tenth of these counts as free.
-        tracks, _ = random_table(camera, n_frames=8, n_points=13, n_components=3)
-        model = fitted(tracks, 3, camera=camera)
+        tracks, _ = random_table(n_frames=8, n_points=13, n_components=3)
+        model = fitted(tracks, 3, camera="weak_perspective")
         assert np.isfinite(model.basis_).all()
         assert 0 < model.noise_variance_ < 1
 
 
 class TestLargeTables:
-    @EACH
     @pytest.mark.slow
-    @pytest.mark.parametrize("gaps", [False, True])
-    def test_end_where_small_ones_do(self, gaps, camera):
+    @pytest.mark.parametrize("camera", SEEN_BY)
+    def test_end_where_small_ones_do(self, camera):
         seen_by = camera if camera == "orthographic" else "weak_perspective"
-        tracks, truth = random_table(seen_by, n_frames=200)
-        tracks = with_gaps(tracks, 0.1) if gaps else tracks
+        tracks, truth = random_table(seen_by, n_frames=200, n_points=40)
+        tracks = with_gaps(tracks, 0.1)
         options = {"tol": 1e-3, "camera": camera}
         sampled = fitted(tracks, kind=SampledNRSfM, **options)
         whole = fitted(tracks, **options)
@@ -199,7 +183,7 @@ class TestLargeTables:
     # In so few rows, the point may look like an outlier.
     @pytest.mark.filterwarnings("ignore:the table has outliers")
     def test_points_that_the_sample_does_not_show(self):
-        tracks, _ = random_table(n_frames=200)
+        tracks, _ = random_table(n_frames=100)
         tracks[8:, 5] = np.nan
         assert np.isfinite(fitted(tracks, kind=SampledNRSfM).basis_).all()
 
@@ -238,18 +222,6 @@ class TestRobustLoss:
         moved = with_outliers(tracks, 2.0, seed=5)
         assert error_of(fitted(moved, loss=loss), tracks, truth) < 1e-3
 
-    @pytest.mark.slow
-    def test_tables_of_more_frames_than_settle_the_weights(self):
-        # 2,000 frames do, also of tables that are too small for a sample.
-        table = make_nonrigid_tracks(2100, 12, 1, noise=0.02, random_state=0).data
-        few, model = (
-            AffineNRSfM(1, loss="cauchy", random_state=0).fit(table[:n_frames])
-            for n_frames in (2000, 2100)
-        )
-        assert model.noise_variance_ == pytest.approx(few.noise_variance_, rel=0.02)
-        assert_allclose(model.mean_shape_, few.mean_shape_, rtol=0, atol=0.02)
-        assert_allclose(model.alpha_, model.transform(table), rtol=0, atol=1e-8)
-
 
 def test_halves_differ_like_independent_tables():
     # All parts differ alike, but for their sum, and about as two tables of this size.
@@ -259,10 +231,12 @@ def test_halves_differ_like_independent_tables():
 
 
 class TestDegenerate:
-    @CALIBRATED
-    @pytest.mark.parametrize("deviation", slow_after(1, [0.0, DEVIATION]))
+    @pytest.mark.parametrize(
+        ("camera", "deviation"),
+        slow_after(1, [("weak_perspective", 0.0), ("orthographic", DEVIATION)]),
+    )
     def test_flat_objects_seen_by_calibrated_cameras(self, camera, deviation):
-        truth = make_nonrigid_tracks(20, 25, 2, camera=camera, random_state=0)
+        truth = make_nonrigid_tracks(20, 20, 2, camera=camera, random_state=0)
         flat = truth.shapes * [1.0, 1.0, 0.0]
         tracks = noisy(flat @ truth.motion.swapaxes(1, 2), deviation, unit=True)
         with warnings.catch_warnings(action="ignore"):  # each frame may be reversed
@@ -273,12 +247,10 @@ class TestDegenerate:
         assert model.inverse_snr_ < max(1.5 * deviation**2, 1e-7)
 
     @EACH
-    @pytest.mark.parametrize("deviation", slow_after(1, [0.0, DEVIATION]))
-    def test_rigid_objects(self, camera, deviation):
-        options = {"n_frames": 40, "n_points": 25, "n_components": 0}
-        tracks, truth = random_table(camera, deviation=deviation, **options)
+    def test_rigid_objects(self, camera):
+        tracks, truth = random_table(camera, deviation=0.0, n_components=0)
         model = fitted(tracks, 2, camera=camera)
-        assert error_of(model, tracks, truth) < max(3 * deviation, 1e-4)
+        assert error_of(model, tracks, truth) < 1e-4
         # Also of frames that look different, which start again
-        other = random_table(camera, seed=1, n_frames=5, n_points=25)[0]
+        other = random_table(camera, seed=1, n_frames=5)[0]
         assert model.transform(table_of(other)).shape == (5, 2)

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from frame_parts import assert_calibrated
-from layers import slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from scenes import likelihood_of, random_scene
@@ -35,7 +34,7 @@ def problem_of(
     Where all points are seen the tracks are centred.
     """
     options = {"noise": noise, "kind": kind, "camera": camera, "deformation": 0.25}
-    scene, cameras = random_scene(0, 30, 18, n_components, **options), CAMERAS[camera]
+    scene, cameras = random_scene(0, 24, 14, n_components, **options), CAMERAS[camera]
     tracks = scene.centred if scene.weights is None else scene.tracks
     rng = np.random.default_rng(seed)
     shapes = centred(scene.shapes + size * rng.normal(size=scene.shapes.shape))
@@ -67,16 +66,12 @@ def images(likelihood, state):
     return centred(motion @ (shapes[0] + np.tensordot(alpha, shapes[1:], 1)))
 
 
-EACH = pytest.mark.parametrize("camera", CAMERAS)
 KINDS = pytest.mark.parametrize("kind", ["complete", "missing"])
-ONE_KIND = pytest.mark.parametrize("kind", slow_after(1, ["complete", "missing"]))
 
 
-@ONE_KIND
-@pytest.mark.parametrize("size", slow_after(1, [0.2, 0.0]))
-def test_optimum_is_the_same_from_other_starts(kind, size):
-    likelihood, _, expected = optimum(kind=kind)
-    _, start = problem_of(kind=kind, seed=2, size=size)
+def test_optimum_is_the_same_from_other_starts():
+    likelihood, _, expected = optimum()
+    _, start = problem_of(seed=2, size=0.2)
     got = refined(likelihood, start, tol=1e-7)
     assert got.history[-1] == pytest.approx(expected.history[-1], abs=1e-2)
     assert got.state.noise == pytest.approx(expected.state.noise, rel=1e-3)
@@ -84,9 +79,8 @@ def test_optimum_is_the_same_from_other_starts(kind, size):
     assert_allclose(*pair, atol=1e-3)
 
 
-@pytest.mark.parametrize("tol", [1.0, 1e-4])
-def test_tolerance_is_of_two_steps_one_after_the_other_and_a_frame(tol):
-    likelihood, start = problem_of()
+def test_tolerance_is_of_two_steps_one_after_the_other_and_a_frame():
+    (likelihood, start), tol = problem_of(), 1e-2
     whole = refined(likelihood, start, tol=tol)
     small = -np.diff(whole.history) < tol * len(start.motion)
     assert whole.converged
@@ -98,9 +92,8 @@ def test_tolerance_is_of_two_steps_one_after_the_other_and_a_frame(tol):
         assert_array_equal(part.history, whole.history[: max_iter + 1])
 
 
-@ONE_KIND
-def test_tolerance_of_zero_ends_where_rounding_errors_are_left(kind):
-    likelihood, _, best = optimum(kind=kind)
+def test_tolerance_of_zero_ends_where_rounding_errors_are_left():
+    likelihood, _, best = optimum()
     result = refined(likelihood, best.state, tol=0.0, max_iter=5000)
     assert result.converged
     assert len(result.history) < 1000
@@ -110,8 +103,14 @@ def test_tolerance_of_zero_ends_where_rounding_errors_are_left(kind):
     assert len(again.history) < 10
 
 
-@EACH
-@KINDS
+@pytest.mark.parametrize(
+    ("camera", "kind"),
+    [
+        ("affine", "missing"),
+        ("weak_perspective", "complete"),
+        ("orthographic", "missing"),
+    ],
+)
 class TestCameras:
     def test_objective_falls_and_rises_in_every_direction(self, camera, kind):
         likelihood, start, result = optimum(camera, kind, 1.0, 1)
@@ -181,8 +180,8 @@ def test_shapes_and_noise_are_fitted_to_held_cameras(kind):
         assert after < 1e-5 * before
 
 
-@pytest.mark.parametrize("camera", CAMERAS)
-def test_noise_stays_above_the_least(camera):
+def test_noise_stays_above_the_least():
+    camera = "weak_perspective"
     likelihood, start = problem_of(camera)
     least = 10 * DEVIATION**2 / np.divide(*likelihood.frames.totals[::-1])
     result = refined(likelihood, start, camera, tol=1e-6, least_noise=least)
@@ -220,5 +219,5 @@ class TestDegenerate:
     def test_cameras_of_zero(self):
         likelihood, start = problem_of()
         start.motion[:] = 0.0
-        result = refined(likelihood, start)
+        result = refined(likelihood, start, max_iter=50)
         assert all(np.isfinite(each).all() for each in result.state)

@@ -57,9 +57,7 @@ def with_few_basis_shapes(scene):
     return scene, *(scene._replace(shapes=each) for each in (scene.shapes[:1], zeros))
 
 
-PENALTIES = pytest.mark.parametrize(
-    "penalty", [0.0, PENALTY, np.array([0.5, 2.0, 7.0])]
-)
+PENALTIES = pytest.mark.parametrize("penalty", [0.0, np.array([0.5, 2.0, 7.0])])
 
 
 def precisions():
@@ -154,10 +152,8 @@ def assert_same(got, expected):
         assert_allclose(one, other, rtol=1e-9, atol=1e-11 * scale, err_msg=name)
 
 
-@pytest.mark.parametrize("size", [1, 4])
-def test_size_of_blocks_makes_no_difference(scene, size):
-    whole = scene.at(PENALTY, block_frames=len(scene.tracks))
-    assert_same(scene.at(PENALTY, block_frames=size), whole)
+def test_size_of_blocks_makes_no_difference(scene):
+    assert_same(scene.at(PENALTY, block_frames=4), scene.at(PENALTY))
 
 
 @pytest.mark.parametrize("hidden", [np.nan, 1e6])

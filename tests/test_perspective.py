@@ -1,6 +1,5 @@
 """Perspective cameras: tests by definition of geometry, fit and methods."""
 
-import warnings
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,9 +11,10 @@ from scenes import with_gaps
 from scipy.spatial.transform import Rotation
 from sklearn import config_context
 
-from isa_nrsfm import AffineNRSfM, AffineNRSfMCV
+from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.export import frame_points, frame_poses
 from isa_nrsfm.io import load_model, save_model
+from isa_nrsfm.metrics import mean_shape_error_3d
 
 F, CENTRE = 1000.0, (640.0, 360.0)
 PERSPECTIVE = {"camera": "perspective", "focal_length": F, "principal_point": CENTRE}
@@ -59,14 +59,13 @@ def fitted(X, kind=AffineNRSfM, **params):
 
 
 def frame_error(shapes, truth):
-    """Return the mean error of shapes after a rotation and a scale for each frame."""
-    errors = []
-    for a, b in zip(shapes - shapes.mean(axis=1, keepdims=True), truth, strict=True):
-        U, values, V = np.linalg.svd(a.T @ b)
-        sign = np.array([1.0, 1.0, np.sign(np.linalg.det(U @ V))])
-        scale = (sign * values).sum() / np.sum(a**2)
-        errors.append(np.linalg.norm(scale * a @ (U * sign) @ V - b))
-    return np.mean(errors) / np.sqrt(np.mean(np.sum(truth**2, axis=(1, 2))))
+    """Return the mean error of shapes after a rotation and a scale for each frame.
+
+    The mirror image is infinitely wrong.
+    """
+    turn, *_ = np.linalg.lstsq(shapes.reshape(-1, 3), truth.reshape(-1, 3))
+    error = mean_shape_error_3d(truth, shapes, convention="frame")
+    return error if np.linalg.det(turn) > 0 else np.inf
 
 
 @pytest.fixture(scope="module")
@@ -78,18 +77,13 @@ def noisy():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("seed", "size"),
-    [(0, (25, 12)), *((n, (40, 16)) for n in range(20))],
-)
+@pytest.mark.parametrize(("seed", "size"), [(0, (25, 12)), (19, (40, 16))])
 def test_without_noise_the_fit_is_exact(seed, size):
     n_frames, n_points = size
-    distance = 2.4 * (2.5 + 0.25 * seed)  # radii
-    s = scene(seed, n_frames, 40.0, distance, n_points=n_points)
-    X, S, R = s.X, s.S, s.R
-    model = fitted(X, tol=1e-3)
-    assert frame_error(model.reconstruct(X), S) < 1e-4
-    turned = model.rotations_.mT @ R
+    s = scene(seed, n_frames, 40.0, 2.4 * (2.5 + 0.25 * seed), n_points=n_points)
+    model = fitted(s.X, tol=1e-3)
+    assert frame_error(model.reconstruct(s.X), s.S) < 1e-4
+    turned = model.rotations_.mT @ s.R
     assert np.abs(turned - turned[0]).max() < 2e-3
 
 
@@ -126,7 +120,7 @@ def test_frames(noisy, tmp_path):
 def test_perspective_decides_the_mirror_image(noisy):
     X, S, model = noisy.X, noisy.S, noisy.model
     assert model.mirror_certainty_ > 0.9
-    assert np.linalg.det(np.linalg.lstsq(model.mean_shape_, S.mean(axis=0))[0]) > 0
+    assert frame_error(model.reconstruct(X), S) < 0.01
     refused("decides between the two mirror images", model.mirrored)
     # Images flipped left-right show an object that is flipped left-right
     tracks = X.reshape(len(X), -1, 2) * (-1, 1) + (2 * CENTRE[0], 0)
@@ -222,17 +216,6 @@ def test_tables_without_perspective_say_so():
 
 
 @pytest.mark.slow
-def test_frontal_objects_in_the_middle_say_so():
-    X = scene(n_frames=30, yaw=0.5, spread=0.02, noise=0.01).X
-    with warnings.catch_warnings(record=True, action="always") as messages:
-        model = fitted(X, AllStarts)
-    assert any(WEAK in str(each.message) for each in messages)
-    assert model.camera_ == "weak_perspective"
-    assert_array_equal(model.transform(X), model.alpha_)
-    assert model.mirrored().score(X) == pytest.approx(model.score(X), rel=0.2)
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize("refinement", ["joint", "consensus"])
 def test_bodies_that_turn_round(refinement):
     s = scene(1, 60, 180.0, 5.0, 0.002, n_points=14, deformation=0.3)
@@ -247,7 +230,7 @@ def test_bodies_that_turn_round(refinement):
 
 
 @pytest.mark.slow
-def test_perspective_that_held_out_points_do_not_prefer_is_not_taken(tmp_path):
+def test_perspective_that_held_out_points_do_not_prefer_is_not_taken():
     s = scene(distance=200.0, noise=0.02)
     given = {"focal_length": 0.1 * F}
     model = warned(WEAK, fitted, s.X, **given)
@@ -255,10 +238,6 @@ def test_perspective_that_held_out_points_do_not_prefer_is_not_taken(tmp_path):
     assert model.camera_ == "weak_perspective"
     for name in ("alpha_", "motion_", "rotations_", "positions_"):
         assert_array_equal(getattr(model, name), getattr(weak, name))
-    save_model(model, tmp_path / "model.npz")
-    loaded = load_model(tmp_path / "model.npz")
-    assert loaded.camera_ == "weak_perspective"
-    assert_array_equal(frame_poses(loaded).yaw, frame_poses(weak).yaw)
 
 
 WEAK_LENS = {"camera": "weak_perspective", "focal_length": F}
@@ -267,7 +246,7 @@ WEAK_LENS = {"camera": "weak_perspective", "focal_length": F}
 @pytest.fixture(scope="module")
 def far():
     """A table of distant objects at the sides of images, and its fit."""
-    table = scene(n_frames=25, distance=60.0, noise=0.002, spread=0.4)
+    table = scene(n_frames=16, distance=60.0, noise=0.002, spread=0.4)
     table.model = fitted(table.X, **WEAK_LENS)
     return table
 
@@ -321,35 +300,6 @@ def test_results_in_the_axes_of_the_camera(far, mirrored, tmp_path):
     loaded = load_model(tmp_path / "model.npz")
     assert_array_equal(loaded.reconstruct(X, axes="camera"), turned)
     assert_array_equal(frame_poses(loaded, X).pitch, poses.pitch)
-
-
-def test_a_camera_that_turns_about_its_axis_turns_the_axes(far):
-    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()
-    X = far.X.reshape(len(far.X), -1, 2) - CENTRE
-    X = 10 * (X @ quarter[:2, :2].T + CENTRE).reshape(far.X.shape)
-    lens = {"focal_length": 10 * F, "principal_point": np.multiply(10, CENTRE)}
-    other = fitted(X, **WEAK_LENS | lens)
-    same_model(far.model, other, tol=5e-3, turn=quarter)
-
-
-@pytest.mark.slow
-def test_outliers(noisy):
-    X, S = noisy.X, noisy.S
-    wrong = X.reshape(len(X), -1, 2).copy()
-    rng = np.random.RandomState(3)
-    where = rng.uniform(size=wrong.shape[:2]) < 0.03
-    wrong[where] += 400 * rng.standard_normal((where.sum(), 2))
-    wrong = wrong.reshape(X.shape)
-    model = fitted(wrong, loss="cauchy")
-    assert frame_error(model.reconstruct(wrong), S) < 0.02
-
-
-@pytest.mark.slow
-def test_number_of_basis_shapes():
-    X = scene(n_frames=60, noise=0.005).X
-    assert len(fitted(X, AllStarts, n_components="auto").basis_) == 2
-    trial = AllStarts(**PERSPECTIVE)
-    assert AffineNRSfMCV((1, 2), estimator=trial, cv=2).fit(X).n_components_ == 2
 
 
 test_refusals = refusals_of("perspective", globals())

@@ -1,7 +1,5 @@
 """Stability of coefficients: halves of a table, and what is said of them."""
 
-import pickle
-
 import numpy as np
 import pytest
 from layers import slow_after
@@ -14,7 +12,7 @@ from isa_nrsfm.datasets import make_face_tracks
 from isa_nrsfm.io import load_model, save_model
 
 
-def faces(noise=0.01, n_frames=240):
+def faces(noise=0.01, n_frames=120):
     return make_face_tracks(n_frames, n_components=3, noise=noise, random_state=0).data
 
 
@@ -45,18 +43,16 @@ def test_what_noise_decides_is_less_stable():
 
 @pytest.mark.slow
 def test_groups_jobs_and_files(tmp_path):
-    table, groups = faces(), np.repeat(np.arange(40), 6)
+    table, groups = faces(), np.repeat(np.arange(40), 3)
     model = AffineNRSfM(3, random_state=0).fit(table, groups=groups)
     again = AffineNRSfM(3, random_state=0, n_jobs=2).fit(table, groups=groups)
     assert_array_equal(model.stability_, again.stability_)
     rows = fitted()
     assert (rows.stability_ != model.stability_).any()
-    copied = pickle.loads(pickle.dumps(rows))
     save_model(rows, tmp_path / "model.npz")
     loaded = load_model(tmp_path / "model.npz")
-    for each in (copied, loaded):
-        assert_array_equal(each.stability_, rows.stability_)
-        assert_array_equal(each.stable_sets_, rows.stable_sets_)
+    for name in ("stability_", "stable_sets_"):
+        assert_array_equal(getattr(loaded, name), getattr(rows, name))
     few = AffineNRSfM(3, random_state=0).fit(table, groups=groups // 20)
     assert np.isnan(few.stability_).all()
     assert few.diagnostics().stability == ("",) * 3
