@@ -318,7 +318,7 @@ def _joint_fit(
 def supported_components(
     table: ScaledTable, isa: Any, settings: FitSettings, progress: Progress
 ) -> int:
-    """Return the number of relevant basis shapes of affine cameras, at most twelve."""
+    """Return the number of relevant basis shapes, at most twelve."""
     K, quiet = possible_components(table, settings), NoProgress()
     factorised = _factorised(table, K, settings, quiet)
     factors = factorised.factors

@@ -356,7 +356,8 @@ def count_components(
     Arguments as in `fit_jointly`, with more basis shapes than are expected.
     """
     problem = next(_problems(table, paper_shapes, settings))
-    fit, *_ = _affine_fit(problem, table, paper_shapes)
+    first_fit = _first_fit if problem.cameras.calibrated else _affine_fit
+    fit, *_ = first_fit(problem, table, paper_shapes)
     widths = whole_distribution(problem, fit.state).widths
     assert widths is not None
     return widths.n_relevant
