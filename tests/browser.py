@@ -1,9 +1,7 @@
 """A headless browser for tests, driven through a pipe by the DevTools protocol."""
 
-import base64
 import contextlib
 import fcntl
-import io
 import json
 import os
 import select
@@ -12,7 +10,6 @@ import signal
 import time
 
 import numpy as np
-from matplotlib.image import imread
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "chrome")
 FLAGS = (
@@ -116,12 +113,6 @@ class Browser:
         box = self.at(name, "getBoundingClientRect().toJSON()")
         return [box[side] for side in ("x", "y", "width", "height")]
 
-    def picture(self, name):
-        """Return what an element shows, (height, width, 3), from 0 to 1."""
-        place = dict(zip(("x", "y", "width", "height"), self.box(name), strict=True))
-        taken = self.call("Page.captureScreenshot", clip=place | {"scale": 1})
-        return imread(io.BytesIO(base64.b64decode(taken["data"])))[..., :3]
-
     def wait(self, condition):
         """Wait until a condition is true."""
         until = time.monotonic() + PATIENCE
@@ -136,13 +127,6 @@ class Browser:
         kinds = "mousePressed", "mouseMoved", "mouseReleased"
         for kind, (x, y) in zip(kinds, (start, end, end), strict=True):
             self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, **button)
-
-    def touch(self, *moves):
-        """Move fingers from places to others, and lift them."""
-        kinds = "touchStart", "touchMove", "touchEnd"
-        for kind, places in zip(kinds, (*moves, []), strict=True):
-            points = [{"x": x, "y": y, "id": i} for i, (x, y) in enumerate(places)]
-            self.call("Input.dispatchTouchEvent", type=kind, touchPoints=points)
 
     def press(self, key, code=0):
         """Press a key."""

@@ -208,32 +208,3 @@ def damage_hdf5(path, rng):
             case _:
                 file[name] = pick(rng, others)
         file[name].attrs.update(attributes)
-
-
-def damaged_parquet(content, rng):
-    """Return a parquet file of which a column, or its metadata, is another."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(io.BytesIO(content))
-    place, n = int(rng.integers(table.num_columns)), table.num_rows
-    name, said = table.column_names[place], table.schema.metadata or {b"pandas": b"{}"}
-
-    def changed_metadata():
-        changed = {key: damaged_bytes(text, rng) for key, text in said.items()}
-        return table.replace_schema_metadata(changed)
-
-    def other_column():
-        values = None, "1.5", True, b"x", [1.0], {"a": 1}, 2**62, np.inf, 1e308, np.nan
-        column = pa.array(n * [pick(rng, values)])
-        return table.set_column(place, name, column).replace_schema_metadata(said)
-
-    changes = [
-        lambda: table.remove_column(place),
-        lambda: table.append_column(name, table.column(place)),
-        lambda: table.slice(0, int(rng.integers(n))),
-        *(changed_metadata, other_column, other_column),
-    ]
-    buffer = io.BytesIO()
-    pq.write_table(pick(rng, changes)(), buffer)
-    return buffer.getvalue()

@@ -14,7 +14,6 @@ from layers import may_not_converge, slow_after
 from project import ROOT
 from refusals import refusals_of
 from scenes import random_rotation
-from scipy.spatial.transform import Rotation
 
 import benchmarks.__main__ as command
 from benchmarks import _fits, _paper, questions, real
@@ -104,30 +103,6 @@ def test_errors_of_shapes_leave_out_their_rotations_and_a_mirror_image(rng):
     common = [real.common_shape(shapes)]
     error = mean_shape_error_3d(truth[:1], common, convention="frame")
     assert error == pytest.approx(0.0, abs=1e-12)
-
-
-def test_views_are_told_by_the_turn_from_the_front():
-    yaws = Rotation.from_euler("y", [[5], [12], [-30], [40]], degrees=True).as_matrix()
-    backwards = np.diag([1.0, -1.0, -1.0])  # y down and z away from the viewer
-    for rotations in (yaws, backwards @ yaws @ backwards, yaws @ backwards):
-        views = questions.views_of(rotations)
-        found = {name: np.flatnonzero(views[name]).tolist() for name in views}
-        assert (found["near"], found["frontal"], found["turned"]) == (
-            [0],
-            [0, 1],
-            [2, 3],
-        )
-        assert {np.argmax(views["left"]), np.argmax(views["right"])} == {2, 3}
-
-
-def test_turns_and_shares_of_cameras(rng):
-    turn = Rotation.from_rotvec([[0, 0, 0], [0, 0.3, 0], [0.1, 0, 0]]).as_matrix()
-    pose = Rotation.from_rotvec(rng.normal(size=(20, 3))).as_matrix()
-    rotations = (turn @ pose[:, None]).reshape(-1, 3, 3)
-    np.testing.assert_allclose(real.turns(rotations, 3, 0), np.degrees([0.3, 0.1]))
-    alpha = rng.normal(size=(20, 1, 2)) + np.array([[0, 0], [0, 3], [0, 6]])
-    shares = real.camera_share(alpha.reshape(-1, 2), 3)
-    assert list(shares) == pytest.approx([0.0, 6 / alpha[..., 1].var()])
 
 
 @pytest.mark.slow

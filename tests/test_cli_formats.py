@@ -13,7 +13,7 @@ from isa_nrsfm import AffineNRSfM
 from isa_nrsfm.datasets import make_face_tracks, make_nonrigid_tracks
 from isa_nrsfm.io import find_format  # noqa: F401  in refusals.txt
 
-N_FRAMES = 32
+N_FRAMES = 20
 LOST, EMPTY = 3, 7
 QUICK = "-k 1 --isa fast --n-init 2 --refinement none --no-figures".split()
 
@@ -106,7 +106,7 @@ def axis_of(written, options=""):
 def test_columns_make_any_file_a_table(fits, transforms, tmp_path):
     path, *_ = write_openface(tmp_path)
     out = fits(path, "--columns", "x_#,y_#", *QUICK).page
-    assert "in 32 frames" in out
+    assert "in 20 frames" in out
     assert "x_0, y_0, x_1, y_1, ..., x_67, y_67" in out
     assert "eye_lmk_x_#,eye_lmk_y_# (56)" in out.partition("coordinates not used: ")[2]
     # Models transform files of other formats.

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from fit_runs import Results, ran
-from landmark_files import saved, saved_scene
+from landmark_files import saved
 from layers import slow_after
 from matplotlib.figure import Figure
 from numpy.testing import assert_allclose
@@ -19,7 +19,6 @@ from sklearn.model_selection import GroupKFold
 from isa_nrsfm import AffineNRSfM, AffineNRSfMCV, FastISA
 from isa_nrsfm.analysis import WithinGroups, association, between_share
 from isa_nrsfm.cli import main
-from isa_nrsfm.datasets import make_nonrigid_tracks
 from isa_nrsfm.export import frame_poses
 
 N = 60
@@ -166,25 +165,6 @@ def test_means_of_classes_are_of_significant_coefficients(answers):
         order = sorted(means, key=lambda name: -abs(means[name][k]))
         shown = ", ".join(f"{name} {means[name][k]:+.1f}" for name in order)
         assert (f"alpha_{k + 1}: {shown}." in found.page) == is_related
-
-
-@pytest.mark.slow
-def test_twelve_basis_shapes_are_drawn_and_twelve_classes_listed(fits, tmp_path):
-    scene = make_nonrigid_tracks(60, 45, 13, noise=0.01, random_state=0)
-    classes = pd.qcut(
-        scene.shapes[:, 0, 0], 13, labels=[f"class{i}" for i in range(13)]
-    )
-    path = saved_scene(tmp_path / "table.csv", scene, mood=classes)
-    options = "-k 13 --refinement none --isa fast --n-init 1 --label mood --fps 1"
-    with drawn() as figures:
-        found = fits(path, *options.split())
-    label, time, shapes, *_ = figures
-    titles = " ".join(axes.get_title("left") for axes in shapes.axes)
-    assert re.findall(r"shape (\d+)", titles) == [str(k) for k in range(1, 13)]
-    assert len(label.axes) == len(time.axes) == 12
-    line = re.search(r"alpha_\d+: class.*", found.page)[0].strip()
-    assert line.count("class") == 12
-    assert line.endswith("(all in report.json).")
 
 
 def test_figures_have_legends_and_residuals(answers):

@@ -55,7 +55,7 @@ def bodies_fit(table, tmp_path_factory):
 
 
 def test_layouts_are_recognised_by_order_or_names(fits, bodies, bodies_fit, tmp_path):
-    path = write(datasets.make_hand_tracks(60, random_state=0), tmp_path / "hands.csv")
+    path = write(datasets.make_hand_tracks(24, random_state=0), tmp_path / "hands.csv")
     found = fits(path, *UNDRAWN)
     assert "(hand-21)" in found.out
     assert found.report["model"]["skeleton"] == "hand-21"
@@ -132,13 +132,12 @@ def test_where_y_is_zero_is_said(fits, transforms, succeeds, tmp_path):
         succeeds("export", fit.path, "-o", page, "--origin", name)
     transforms(fit.path, path, *lower, "--std")
     pages = [tmp_path / "viewer.html", lower[-1], *exported.values()]
-    fitted, new, upper_shapes, shapes = map(content_of, pages)
+    fitted, new, upper, shapes = map(content_of, pages)
     assert fitted["shapes"] == shapes["shapes"] == new["shapes"]
-    assert fitted["shapes"] != upper_shapes["shapes"]
+    assert fitted["shapes"] != upper["shapes"]
     # Error bars are those that are asked for.
     assert fitted["deviations"] == new["deviations"] != ""
-    transforms(fit.path, path, *lower)
-    assert content_of(lower[-1])["deviations"] == ""
+    assert upper["deviations"] == ""
     yaw = {name: frame_poses(fit.model, origin=name).yaw for name in exported}
     np.testing.assert_allclose(fit.cameras["yaw"], yaw["lower"], atol=1e-6)
     assert not np.allclose(fit.cameras["yaw"], yaw["upper"], atol=1)

@@ -172,29 +172,10 @@ def test_amplitude_is_the_relative_size_of_the_deformation(shapes, amplitude):
     assert_allclose(norms, norms[0])
 
 
-@pytest.mark.parametrize(
-    ("kind", "of_shapes", "of_numbers"),
-    [("gaussian", 5 / 3, 3.0), ("heavy_tailed", 5.0, 6.0)],
-)
-def test_tails_of_basis_shapes_and_coefficients(kind, of_shapes, of_numbers):
-    # E r^4 / (E r^2)^2 of the radius: 15 / 9 for a Gaussian 3-vector, and 3 times that
-    # after the multiplication with a Gaussian number.
-    basis = make_nonrigid_tracks(2, 100_000, 1, shapes=kind, random_state=0).basis[0]
-    energy = np.sum(basis**2, axis=1)
-    assert_allclose(np.mean(energy**2) / np.mean(energy) ** 2, of_shapes, rtol=0.05)
-    # Directions are uniform on the sphere.
-    directions = basis / np.sqrt(energy)[:, None]
-    assert_allclose(np.cov(directions.T), np.eye(3) / 3, atol=0.005)
-    options = {"coefficients": kind, "random_state": 0}
-    alpha = make_nonrigid_tracks(50_000, 4, 2, **options).alpha
-    assert_allclose(np.mean(alpha**4, axis=0), of_numbers, rtol=0.1)
-    assert_allclose(np.mean(alpha[:, 0] * alpha[:, 1]), 0, atol=0.02)
-
-
 @pytest.fixture(scope="module")
 def expressive():
     """Many faces with all expressions."""
-    return make_face_tracks(20_000, n_components=8, random_state=0)
+    return make_face_tracks(8_000, n_components=8, random_state=0)
 
 
 @pytest.fixture(scope="module")
@@ -247,7 +228,7 @@ class TestFace:
         strongest = strength[:, :7].argmax(axis=1)  # the width is no expression
         assert_array_equal(faces.labels, np.array(faces.component_names)[strongest])
         assert not faces.groups.any()
-        assert_allclose(faces.time, np.arange(20_000) / 25)
+        assert_allclose(faces.time, np.arange(8_000) / 25)
         assert set(make_face_tracks(5, n_components=0).labels.tolist()) == {"rest"}
 
     def test_angles_are_those_of_the_cameras(self):
@@ -294,23 +275,6 @@ class TestPeople:
         firsts = lengths[[np.argmax(scene.groups == person) for person in range(3)]]
         assert_allclose(lengths, firsts[scene.groups], rtol=1e-6)
         assert np.ptp(firsts, axis=0).min() > 1e-3 * np.mean(firsts)
-
-    def test_poses_are_what_they_are_called(self):
-        hands = make_hand_tracks(400, random_state=0)
-        tips = np.linalg.norm(hands.shapes[:, [8, 12]] - hands.shapes[:, [0]], axis=2)
-        spread, fist, point = (
-            np.median(tips[hands.labels == name], axis=0)
-            for name in ("open", "fist", "point")
-        )
-        assert (fist < 0.7 * spread).all()
-        assert point[0] > 0.9 * spread[0]  # the index finger
-        assert point[1] < 0.7 * spread[1]
-        bodies = make_body_tracks(400, random_state=0)
-        y = dict(zip(bodies.point_names, bodies.shapes[:, :, 1].T, strict=True))
-        height = np.ptp(bodies.shapes[:, :, 1], axis=1)
-        assert bodies.labels[height.argmin()] == "squat"
-        raised = y["right_wrist"] < y["nose"]
-        assert {*bodies.labels[raised].tolist()} == {"reach"}
 
 
 test_refusals = refusals_of("datasets", globals())

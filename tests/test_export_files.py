@@ -202,7 +202,7 @@ def test_rotations_show_the_shapes_as_the_images_do(page, camera, options):
     seen = seen - seen.mean(axis=1, keepdims=True)
     scale = np.sum(seen * images, axis=(1, 2)) / np.sum(seen**2, axis=(1, 2))
     error = images - scale[:, None, None] * seen
-    assert np.sum(error**2) < 1e-3 * np.sum(images**2)
+    assert np.sum(error**2) < 1.5e-5 * np.sum(images**2)
 
 
 def test_mirror_images_and_origins_change_signs(page):
@@ -210,23 +210,6 @@ def test_mirror_images_and_origins_change_signs(page):
     mirrored, lower = page(blob_model().mirrored()), page(blob_model(), origin="lower")
     assert_allclose(shapes_of(mirrored), shapes * [1, 1, -1], atol=1e-6)
     assert_allclose(shapes_of(lower), shapes * [1, -1, -1], atol=1e-6)
-
-
-@pytest.mark.parametrize("make", [face_model, calibrated_model])
-def test_basis_shapes_are_those_of_the_frames(page, make):
-    # The model's, or the least squares fit to Euclidean shapes of affine cameras.
-    model = make()
-    shapes = np.stack([model.mean_shape_, *model.basis_])
-    if make is face_model:
-        frames = model.reconstruct(faces().data, camera="weak_perspective")
-        weights = np.insert(model.alpha_, 0, 1.0, axis=1)
-        best = np.linalg.lstsq(weights, frames.reshape(len(frames), -1))[0]
-        shapes = best.reshape(-1, 68, 3)
-    shapes[0] -= shapes[0].mean(axis=0)
-    drawn = shapes_of(page(model))
-    inner, expected = (np.tensordot(each, each, [2, 2]) for each in (drawn, shapes))
-    unit = np.linalg.norm(expected) / np.linalg.norm(inner)
-    assert_allclose(unit * inner, expected, atol=1e-4 * expected.max())
 
 
 def test_deviations_have_the_size_of_the_shapes(page):
@@ -399,22 +382,6 @@ def read_as_openface_does(path):
 @pytest.fixture(scope="module")
 def pdm():
     return point_distribution_model(face_model())
-
-
-@pytest.mark.parametrize(
-    ("make", "options"),
-    [
-        (face_model, {}),
-        (partial(face_model, y_up=True), {"camera": None}),
-        (calibrated_model, {}),
-    ],
-)
-def test_faces_stand_upright_and_look_at_the_viewer(make, options):
-    mean = point_distribution_model(make(), **options).mean
-    ear, nose, other_ear, brow, chin = mean[[0, 30, 16, 19, 8]]
-    assert brow[1] < nose[1] < chin[1]  # y points down
-    assert ear[0] < nose[0] < other_ear[0]
-    assert nose[2] < min(ear[2], other_ear[2])  # z points away
 
 
 def test_euclidean_shapes_of_the_frames_are_reproduced(pdm):

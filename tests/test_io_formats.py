@@ -9,7 +9,7 @@ import landmark_files as files
 import numpy as np
 import pandas as pd
 import pytest
-from landmark_files import EXPECTED, FRAME, MESH, TRACKS, WFLW, WRITERS, tracks_of
+from landmark_files import EXPECTED, FRAME, TRACKS, WFLW, WRITERS, tracks_of
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of, refused, warned
@@ -95,7 +95,7 @@ def lost(landmarks):
     return list(np.flatnonzero(np.isnan(tracks_of(landmarks)).all(axis=(1, 2))))
 
 
-def mesh(folder, tracks=MESH, **given):
+def mesh(folder, tracks, **given):
     return files.write_mesh(folder / "a.csv", tracks, **given)
 
 

@@ -181,14 +181,6 @@ def test_points_of_two_to_four_numbers(tracks, further):
             assert_array_equal(found, table_of(points, layout))
 
 
-def test_two_rows_of_points_are_no_visibilities():
-    # y of every second point is from 0 to 0.2, those of the others are not.
-    x, phase = np.linspace(-2, 2, 24), np.random.default_rng(0).uniform(0, 6, (60, 1))
-    y = np.where(np.arange(24) % 2, 0.1, -0.1) + 0.02 * np.sin(3 * x + phase)
-    X = np.stack([x * (1 + 0.1 * np.cos(phase)), y], axis=2).reshape(60, -1)
-    AffineNRSfM(1, refinement=None).fit(X)
-
-
 @pytest.mark.parametrize("still", [2, 30])
 def test_points_that_stand_still(still):
     walk = 30 * np.cumsum(np.random.default_rng(0).normal(size=(60, 1, 2)), axis=0)

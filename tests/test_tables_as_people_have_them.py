@@ -140,20 +140,6 @@ def test_shares_of_annotations_are_warned_of_with_a_way_that_works(tmp_path):
     assert_allclose(scope["points"], (shares * [640, 480]).reshape(N, -1))
 
 
-@pytest.mark.parametrize("code", [(0, 0), (-310, -205)])
-def test_codes_of_missing_points_in_python(tmp_path, code):
-    tracks, hidden = POINTS.copy(), np.random.default_rng(1).random((N, 8)) < 0.1
-    tracks[hidden] = code
-    table, fit = table_of(PLAIN_NAME, tracks), UNREFINED.fit
-    path = files.saved(tmp_path / "a.csv", table)
-    for call, X in ((read_landmarks, path), (fit, table.to_numpy())):
-        text, _ = warnings_of(call, X)
-        assert f"exactly ({code[0]}, {code[1]}) ({hidden.sum()} in all)" in text
-    assert ("make them NaN before coordinates are shifted" in text) == (code[0] < -1)
-    tracks[hidden] = np.nan  # as advised
-    assert "exactly" not in warnings_of(fit, tracks.reshape(N, -1))[0]
-
-
 def test_times_in_names_of_images_are_told(tmp_path, begins):
     times = pd.Series(pd.date_range("2023-05-01 12:00:30", periods=N, freq="2s"))
     names = times.dt.strftime("%Y-%m-%d_%H-%M-%S.png")

@@ -246,21 +246,6 @@ def test_error_bars_are_along_the_viewing_direction(program, tmp_path):
     assert program.complaints() == []
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_left_and_right_have_colours_of_their_own(program, tmp_path, scheme):
-    media = [{"name": "prefers-color-scheme", "value": scheme}]
-    program.call("Emulation.setEmulatedMedia", features=media)
-    opened(program, tmp_path, face_model())
-    program.run(DRAWN)
-    red, green, blue = np.moveaxis(program.picture("scene"), 2, 0)
-    program.call("Emulation.setEmulatedMedia", features=[])
-    left = (green > red + 0.12) & (green > blue)
-    right = (red > green + 0.12) & (blue > green + 0.04)
-    # The left side of a face that looks at us is on the right.
-    assert np.nonzero(right)[1].mean() + 20 < np.nonzero(left)[1].mean()
-    assert not program.at("sides", "hidden")
-
-
 def test_videos_play_at_true_speed(program, tmp_path):
     seconds = np.arange(N_FRAMES) * 0.05
     opened(program, tmp_path, face_model(), times=seconds, n_frames=N_FRAMES)
