@@ -170,7 +170,7 @@ class TestAssociation:
 
     # Nine in ten videos would, if single frames were permuted.
     @pytest.mark.parametrize(
-        "trial", slow_after(4, [people, video, spread, sessions, rhythms])
+        "trial", slow_after(2, [people, video, spread, sessions, rhythms])
     )
     def test_labels_go_with_nothing_by_chance(self, trial):
         assert significant(trial) <= 0.1

@@ -219,18 +219,6 @@ class TestLowRank:
         # The shapes are right without any coordinate system of the cameras, too.
         assert mean_shape_error_3d(truth.shapes, model.shapes_) < 2e-3
 
-    def test_new_frames(self):
-        truth = table(n_frames=200)
-        model = BlockMatrixNRSfM(2).fit(truth.data[:150])
-        rest = np.linalg.norm(model.reconstruct(truth.data[:150]) - model.shapes_)
-        assert rest < 0.02 * np.linalg.norm(model.shapes_)
-        new = truth.data[150:]
-        assert inverse_snr(new, model.reproject(new)) < 2 * 0.01**2
-        # The coefficients are those of the truth, mixed.
-        alpha, expected = model.transform(new), truth.alpha[150:]
-        rest = np.linalg.lstsq(np.column_stack([alpha, np.ones(50)]), expected)[1]
-        assert (rest / np.sum(expected**2, axis=0) < 0.02).all()
-
 
 def sparse_scene(n_frames, n_points, n_atoms, sparsity=2):
     """Return a table of sums of so many random atoms, its cameras and its shapes."""
@@ -281,16 +269,6 @@ class TestCompressible:
         assert model.n_users_.sum() == size[0]
         if size[2] == 1:
             assert error_of_frames(shapes, cameras, model) < 1e-6
-
-    def test_atoms_without_shared_frames_are_aligned_by_their_shapes(self, rng):
-        # One shape, nearly, learnt as three atoms.
-        atoms = rng.normal(size=(30, 3)) + 0.05 * rng.normal(size=(3, 30, 3))
-        shapes = (atoms - atoms.mean(axis=1, keepdims=True))[np.arange(60) % 3]
-        cameras = random_cameras(rng, 60)
-        model = CompressibleNRSfM(2, n_atoms=3, sparsity=1, random_state=0)
-        model.fit(table_of(shapes @ cameras.swapaxes(1, 2)))
-        assert model.inverse_snr_ < 1e-3
-        assert error_of_frames(shapes, cameras, model) < 0.1
 
     def test_atoms_that_few_frames_use_are_replaced(self):
         # Twice as many atoms as the shapes have: without it one has no frames.

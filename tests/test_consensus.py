@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from frame_parts import depth_errors
 from layers import Quick, slow_after
+from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal
 from refusals import refusals_of
 from scenes import with_gaps
@@ -25,9 +26,7 @@ from isa_nrsfm._joint.consensus import (
     centred,
     common_coordinates,
     group_fit,
-    group_fits,
     hidden_residuals,
-    interpolation,
     merge,
     neighbourhoods,
     principal_shapes,
@@ -131,17 +130,6 @@ class TestMerge:
             assert_allclose(after.weight, group.weight / (5 * square), rtol=1e-9)
 
 
-def test_interpolation_of_changes():
-    """Chosen points keep their changes; others have means of three of them."""
-    rng = np.random.default_rng(12)
-    chosen = np.array([0, 2, 5, 7])
-    weights = interpolation(rng.standard_normal((3, 9)), chosen)
-    assert_allclose(weights.sum(axis=0), 1.0)
-    assert_array_equal(weights[:, chosen], np.eye(4))
-    others = np.setdiff1d(np.arange(9), chosen)
-    assert ((weights[:, others] > 0).sum(axis=0) == 3).all()
-
-
 def test_principal_shapes_of_frames():
     """Fewer components leave a mean square, which the third argument may bound."""
     S = np.random.default_rng(9).standard_normal((20, 3, 5))
@@ -161,9 +149,9 @@ def test_principal_shapes_of_frames():
 
 def test_share_of_the_joint_fit_by_hidden_points():
     """The true model predicts hidden points, missing ones do not count."""
-    X = make_nonrigid_tracks(30, 15, 1, camera="orthographic", random_state=0).data
-    model = consensus_fit(X, 1, Quick, refinement="joint")._model
-    frames, rows = model.frames, X.reshape(30, 15, 2).mT / model.unit
+    X, fitted_jointly, _ = sufficient_fits()
+    model = fitted_jointly._model
+    frames, rows = model.frames, X.reshape(30, 14, 2).mT / model.unit
     flat = replace(frames, shapes=frames.shapes * [[1.0], [1.0], [0.5]])
     assert np.abs(hidden_residuals(frames, rows)).max() < 1e-4
     assert np.abs(hidden_residuals(flat, rows)).max() > 1e-2
@@ -200,21 +188,6 @@ class TestGroupFit:
         assert np.sqrt(np.mean(off**2)) < 0.02
         assert np.sqrt(np.mean((found[:, :2] - truth[frames, :2]) ** 2)) < 0.02
         assert noise >= 1e-5
-
-    def test_each_group_is_fitted_from_the_cameras_of_each_start(self):
-        """The fits are those of single groups; none depends on the other cameras."""
-        scene, _ = self.scene()
-        cameras = scene.motion, scene.motion[::-1]
-        distances = cdist(scene.first[0].T, scene.first[0].T)
-        starts = list(zip((1.0, 0.5), cameras, strict=True))
-        tasks, fits = group_fits(scene, starts, distances, 2, SETTINGS)
-        assert [start for _, _, start in tasks] == [0, 1]
-        assert tasks[1][1] == 0.5 * tasks[0][1]
-        for (points, *_), motion, fit in zip(tasks, cameras, fits, strict=True):
-            rows, first = scene.rows.take(points, 2), scene.first.take(points, 2)
-            own = scene._replace(rows=rows, first=first, motion=motion)
-            for part, expected in zip(fit, group_fit(own, 2, SETTINGS), strict=True):
-                assert_allclose(part, expected)
 
     def test_frames_with_few_points_are_left_out(self):
         """Frames show at least four points of a group; more than basis shapes do."""
@@ -372,6 +345,15 @@ def error_of(model, table, truth):
     return mean_shape_error_3d(truth, in_camera(model, table), convention="camera")
 
 
+@made_once
+def sufficient_fits(noise=0.0):
+    """Return a table that a joint fit explains, its joint fit and its consensus."""
+    options = {"camera": "orthographic", "noise": noise, "random_state": 0}
+    table = make_nonrigid_tracks(30, 14, 1, **options).data
+    kinds = "joint", "consensus"
+    return table, *(consensus_fit(table, 1, Quick, refinement=k) for k in kinds)
+
+
 @pytest.fixture(scope="module")
 def body():
     """Return the consensus of a body."""
@@ -436,12 +418,7 @@ class TestEstimator:
     @pytest.mark.parametrize("noise", slow_after(1, [0.0, 0.02]))
     def test_a_sufficient_joint_fit_is_kept(self, noise):
         """Groups change no fit whose noise is below their floor or the spectrum's."""
-        options = {"camera": "orthographic", "noise": noise, "random_state": 0}
-        table = make_nonrigid_tracks(30, 14, 1, **options).data
-        joint, model = (
-            consensus_fit(table, 1, Quick, refinement=name)
-            for name in ("joint", "consensus")
-        )
+        table, joint, model = sufficient_fits(noise)
         shapes, expected = in_camera(model, table), in_camera(joint, table)
         assert_allclose(shapes, expected, atol=1e-5 * np.abs(joint.mean_shape_).max())
         if noise:

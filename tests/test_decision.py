@@ -136,17 +136,6 @@ def test_other_settings_are_used_where_needed(name, given, setting, found):
 
 
 @pytest.mark.slow
-def test_the_mean_image_of_a_face_does_not_make_a_table_one_of_faces():
-    rng, face = np.random.default_rng(0), frontal().mean(axis=0)
-    X = face + 0.6 * face.std() * rng.normal(size=(60, len(face)))
-    found, model = tried(X, loss="linear")
-    assert found["weak perspective cameras"].held_out_error > 0
-    told = "the table does not show the points of the prior"
-    assert told in found["face prior"].result
-    assert model.prior is None
-
-
-@pytest.mark.slow
 def test_faces_that_turn_have_no_prior_and_perspective_needs_the_size_of_images():
     faces = make_face_tracks(60, camera="perspective", **GIVEN)
     found, model = tried(faces.data, image_size=2 * np.array(faces.principal_point))

@@ -39,7 +39,7 @@ def of_faces():
     faces = make_face_tracks(n_frames=40, n_components=2, random_state=0)
     table = pd.DataFrame(faces.data, columns=faces.feature_names)
     table.index = [f"image{i}" for i in range(40)]
-    return table, estimator(camera="weak_perspective").fit(table)
+    return table, estimator(camera="weak_perspective", tol=1e3).fit(table)
 
 
 def noisy_scene(n_frames, n_points, noise):

@@ -312,14 +312,6 @@ class TestSmooth:
         )
         assert_allclose(found, expected, atol=1e-12)
 
-    def test_groups_without_points_have_no_coefficients(self):
-        model, table = waving_model()
-        groups = np.repeat([0, 1], [40, 20])
-        unseen = np.where(groups[:, None] == 1, np.nan, table)
-        found = model.smooth(unseen, groups=groups, **FEW_STEPS)
-        assert found.time_scales.shape == (2,)
-        assert_allclose(np.isnan(found.alpha).any(axis=1), groups == 1)
-
     @pytest.mark.parametrize("kind", ["shuffled", "one seen", "none seen"])
     def test_frames_without_dynamics_stay_as_they_are(self, kind):
         model, table = waving_model()

@@ -5,7 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from frame_parts import OF_FRAMES, OF_SHAPES
-from layers import Quick, slow_after
+from layers import slow_after
 from made_once import made_once
 from numpy.testing import assert_allclose, assert_array_equal, assert_equal
 from refusals import refusals_of, refused, warned
@@ -84,22 +84,6 @@ def test_a_frame_is_fitted_alike_whatever_its_neighbours_are(loss, camera):
     # Alone but for the last step, the change to the public shapes.
     alone = np.concatenate([model.transform(row[None]) for row in Y[:6]])
     assert_allclose(alone, together[:6], rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.slow
-def test_rows_that_look_like_other_points_are_not_refused():
-    """The fit that would adapt the model to them is refused.
-
-    They also look so if points of a row determine no camera, which has no fit then.
-    """
-    X, _ = frames_with_outliers()
-    Y = with_gaps(with_outliers(X[:12], X.std(), share=0.3, seed=2), 0.05, seed=2)
-    options = {"loss": "cauchy", "camera": "weak_perspective", "random_state": 0}
-    model = Quick(1, **options).fit(X)
-    adapted = Quick(1, prior=model, **options)
-    refused("does not show the points", adapted.fit, Y[::2])
-    Y[2, 6:] = np.nan
-    warned("wrong. Fit X separately", model.transform, Y)
 
 
 # --- gauge of the paper's refinement ------------------------------------------------

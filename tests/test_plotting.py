@@ -150,10 +150,10 @@ def test_shapes_are_inside_limits_of_one_scale(rng):
 def test_shapes_fit_on_a_page(rng):
     for aspect in (0.25, 3.0):
         mean = rng.uniform(size=(20, 3)) * [aspect, 1, aspect]
-        display = drawn_shapes(mean, np.zeros((6, 20, 3))).plot()
+        display = drawn_shapes(mean, np.zeros((4, 20, 3))).plot()
         figure = display.figure_
         assert figure.axes == list(display.axes_.ravel())
-        assert display.axes_.shape == (7, 2)
+        assert display.axes_.shape == (5, 2)
         assert figure.get_figwidth() == 7.2
         assert figure.get_figheight() <= 7.6
     mean = np.array([[0, 0, 0], [1.0, 2.0, 3.0]])
@@ -182,7 +182,7 @@ LINE = np.array([[0.0, 0, 0], [5, 0, 0], [2, 0, 0], [2, 0, 0], [3, 1, 0]])
 def calibrated():
     """Return a model of calibrated cameras, of points in no known layout."""
     scene = make_nonrigid_tracks(40, 12, 1, camera="weak_perspective", random_state=0)
-    return AffineNRSfM(1, camera="weak_perspective").fit(scene.data)
+    return AffineNRSfM(1, camera="weak_perspective", tol=1e3).fit(scene.data)
 
 
 def test_points_that_are_near_in_the_images_are_joined():
@@ -491,14 +491,13 @@ def test_the_matrix_is_that_of_the_estimator(estimator):
     assert display.ax_.get_title() == f"{share}\n(0 % if uncorrelated)"
 
 
-@pytest.mark.parametrize("n_components", [13, 99])
-def test_labels_of_the_matrix_do_not_touch(n_components):
-    display = drawn_matrix(n_components)
+def test_labels_of_the_matrix_do_not_touch():
+    display = drawn_matrix(99)
     display.figure_.canvas.draw()
     for axis in (display.ax_.xaxis, display.ax_.yaxis):
         labels = [each for each in axis.get_ticklabels() if each.get_text()]
         assert labels[0].get_text() == "1"
-        assert len(labels) >= min(n_components, 7)
+        assert len(labels) >= 7
         boxes = [label.get_window_extent() for label in labels]
         assert not any(a.overlaps(b) for a, b in pairwise(boxes))
         place = int(labels[-1].get_text()) * 3 - 2

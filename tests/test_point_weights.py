@@ -170,11 +170,6 @@ class TestMethods:
         assert_allclose(alone[0], alpha[4], atol=1e-9)
         assert np.abs(model.transform(X) - alpha).max() > 0.1
 
-    def test_fits_that_keep_no_frames(self):
-        (X, weights, _), unkept = noisy(), estimator(keep_frames=False)
-        expected = fitted().transform(X, point_weight=weights)
-        assert_array_equal(unkept.fit_transform(X, point_weight=weights), expected)
-
     def test_cameras_depend_on_ratios_of_tiny_weights(self):
         few, tiny = (
             fitted().decompose(noisy().X, point_weight=scale * noisy().weights).motion

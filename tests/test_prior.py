@@ -300,13 +300,6 @@ def test_squeezed_images_are_named():
     assert model.prior_std_[0] > 0.2
 
 
-def test_objects_of_which_a_prior_has_no_frame_from_behind(turned):
-    X = tracks_of(study(1, 20, 4).X)
-    X[5:7, :, 0] *= -1
-    message = r"2 of 20 rows \(5, 6\) are mirror images"
-    warned(message, fitted, X, turned.model)
-
-
 # --- refusals -------------------------------------------------------------------------
 
 
@@ -314,10 +307,10 @@ def test_other_points_are_refused(turned, frontal):
     X = frontal.X
     other = np.roll(X, 2, axis=1)
     refused("the same points in the same order", fitted, other, turned.model)
-    other[2:] = X[2:]  # a few frames do not make points others, but shapes
-    assert warned(FAR, fitted, other, turned.model).prior_std_[0] > 0.2
     hardly = study(1, 30, 1).X
-    undetermined = warned("depth of the shapes is not determined", fitted, hardly)
+    undetermined = warned(
+        "depth of the shapes is not determined", fitted, hardly, tol=1e3
+    )
     refused("depth of the prior is not determined", fitted, X, undetermined)
 
 

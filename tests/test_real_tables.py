@@ -57,7 +57,7 @@ def fits(load_data):
     return fitted
 
 
-@pytest.mark.parametrize("kind", slow_after(3, FITS))
+@pytest.mark.parametrize("kind", slow_after(2, FITS))
 def test_numbers_of_fits(fits, kind):
     X, _, model = fits(kind)
     energies = model.noise_variance_, model.inverse_snr_, model.score(X[::8])

@@ -124,8 +124,8 @@ def test_a_prior_keeps_its_origin(plain):
 
 def test_what_would_not_be_removed_is_not_advised(table):
     # Yaw is pitch.
-    turned = table.reshape(60, -1, 2)[:, ::2, ::-1].reshape(60, -1)
-    found = Quick(2, **CALIBRATED).fit(turned).diagnostics()
+    turned = table.reshape(60, -1, 2)[:, ::4, ::-1].reshape(60, -1)
+    found = Quick(2, **CALIBRATED, tol=1e3).fit(turned).diagnostics()
     assert found.pose_share.max() > 0.3
     assert found.messages[-1].endswith("compare coefficients of similar views only")
 

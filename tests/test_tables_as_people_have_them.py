@@ -114,7 +114,7 @@ def test_a_body_at_a_desk_in_shares_is_warned_of_and_sized(tmp_path):
     path = files.saved(tmp_path / "pose.csv", table)
     text, plain = warnings_of(read_landmarks, path)
     assert told in text
-    assert "mediapipe" in text
+    assert "format='mediapipe'" in text
     for camera in ("affine", "weak_perspective"):
         fit = clone(UNREFINED).set_params(camera=camera).fit
         text, _ = warnings_of(fit, plain.points.to_numpy())
