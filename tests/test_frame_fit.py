@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.depth import seen
 from isa_nrsfm import AffineNRSfM
+from isa_nrsfm._fitted_model import TableModel, far_points
 from isa_nrsfm._frames.camera_models import CAMERAS, distances, full_rotations, project
 from isa_nrsfm._frames.models import DepthCertainty, FrameMap, FrameModel
 from isa_nrsfm._joint.likelihood import extent_penalty
@@ -357,6 +358,21 @@ def test_certainty_leaves_out_outliers_of_a_robust_loss():
         outlying[::4, :, 3] = left_out
         part, *_ = inlying_rows(frames, FrameBlocks.of_array(rows, 5), 12)
         assert_array_equal(part, np.where(outlying, np.nan, rows))
+
+
+def test_distances_that_noise_and_errors_of_shapes_cause_are_no_misfit(rng):
+    frames, _ = posterior_frames()
+    frames = replace(frames, certainty=DepthCertainty(images=(1.2, 0.3)))
+    shapes = frames.shapes.mT
+    model = TableModel(frames, shapes[0], shapes[1:], 2, "planar", None)
+    variance = (1.2 + 0.3 * len(frames.shapes)) * NOISE**2
+    distance = np.linalg.norm(rng.normal(0, np.sqrt(variance), (2, 20_000)), axis=0)
+    assert_allclose(model.misfit(distance), 1, rtol=0.03)
+    # A few frames do not make points others.
+    distance, other = np.full((9, 5), 0.1), np.full((9, 5), 0.3)
+    distance[:3, 0], distance[3], distance[:2, 1:] = np.nan, np.nan, 9.0
+    assert far_points(distance, replace(frames, noise_variance=0.0)) == 0
+    assert_allclose(far_points(other, replace(frames, noise_variance=0.0)), 0.3)
 
 
 def test_neighbours_are_groups_of_equal_size(rng):
