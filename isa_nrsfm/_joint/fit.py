@@ -182,11 +182,8 @@ def _fit_of_sample(
         fit, least_noise, sufficient = judged(problem, table, fit, start)
     elif table.outliers is None:  # with them the widths follow the weights
         fit = deepened(problem, widened(problem, fit))
-    return (
-        fit._replace(camera_noise_ratio=ratio, rivals=rivals),
-        least_noise,
-        sufficient,
-    )
+    fit = fit._replace(camera_noise_ratio=ratio, rivals=rivals)
+    return fit, least_noise, sufficient
 
 
 def _continued(
