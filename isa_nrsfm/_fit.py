@@ -203,9 +203,8 @@ def fit_table(
             factors.leading(3 * wanted), wanted, isa, settings, progress
         )
         if settings.all_directions:  # the start has a fixed number of basis shapes
-            rigid = factors.rigid_motion.reshape(-1, 2, 3)
-            images = factorised.W.reshape(len(rigid), 2, -1)
-            shapes = lifted_shapes(images, rigid, n_components)
+            images = factorised.W.reshape(len(factors.cameras), 2, -1)
+            shapes = lifted_shapes(images, factors.cameras, n_components)
     else:
         isa, shapes = None, start.shapes
     # 5. Refinement, gauge and frames
@@ -409,8 +408,8 @@ def _paper_fit(
     table = factorised.scaled
     if s.camera != "affine":
         scaled = s.camera == "weak_perspective"
-        rigid = factorised.factors.rigid_motion.reshape(-1, 2, 3)
-        shapes = table.sizes[0] * calibrated_start(rigid, shapes, scaled)[1]
+        _, shapes = calibrated_start(factorised.factors.cameras, shapes, scaled)
+        shapes = table.sizes[0] * shapes
 
     def fitted() -> tuple[TableModel, Decomposition]:
         frames, K = FrameModel.rigid(mean_shape, basis, s.camera), len(basis)

@@ -454,13 +454,13 @@ def _end(fit: JointFit) -> float:
 
 
 def judged(
-    problem: JointProblem, table: FactorisedTable, fit: JointFit, *starts: JointState
+    problem: JointProblem, table: FactorisedTable, fit: JointFit, *states: JointState
 ) -> tuple[JointFit, float, bool]:
     """Decide whether K is sufficient and refit accordingly.
 
     Returns the fit, its noise floor and the decision. K is sufficient if the residual
     does not exceed the noise level of the spectrum. Then the fit is repeated without
-    floor and prior, from its result, or else from the given starts. The result lacks
+    floor and prior, from its result, or else from the given states. The result lacks
     deformation below the floor.
 
     Otherwise the fit keeps them: missing deformation would distort cameras and depths.
@@ -473,7 +473,7 @@ def judged(
     at_floor = fit.state.noise < (1 + 1e-3) * least_noise * mean_square
     # Sufficient: without floor and prior
     if at_floor or fit.state.noise < threshold:
-        for state in (fit.state, *starts):
+        for state in (fit.state, *states):
             released = unregularised(problem, state)
             if released.state.noise < threshold:
                 return released, NOISE_FLOOR, True

@@ -248,8 +248,8 @@ def best_starts(
         trials.append((fit.history[-1], fit.state, motion))
 
     # Rigid cameras, with the paper's and with lifted basis shapes
-    rigid, shapes = factors.rigid_motion.reshape(-1, 2, 3), frames.coordinates(paper)
-    motion, shapes = calibrated_start(rigid, shapes, scaled)
+    shapes = frames.coordinates(paper)
+    motion, shapes = calibrated_start(factors.cameras, shapes, scaled)
     compare(motion, _scaled(seen, motion[sample], shapes))
     compare(motion)
     # Mixtures of more and more columns, until the objective rises. Small tables use all

@@ -62,6 +62,11 @@ class Factorisation(NamedTuple):
     motion: NDArray
     signals: NDArray
 
+    @property
+    def cameras(self) -> NDArray:
+        """Rigid cameras (I, 2, 3)."""
+        return self.rigid_motion.reshape(-1, 2, 3)
+
     def leading(self, n: int) -> "Factorisation":
         """Return the factorisation with at most n signals."""
         return self._replace(motion=self.motion[:, :n], signals=self.signals[:n])
